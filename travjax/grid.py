@@ -1,0 +1,49 @@
+"""The node grid of an elevation map (SPEC section 1).
+
+`heights[row, col]` stands at y = -size/2 + spacing * row (forward, north) and x = -size/2 + spacing * col (right, east);
+the robot starts at (0, 0) and faces +y.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from travjax.config import require, require_number
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A square, node-registered grid.
+
+    size:    metres, edge of the map; 8 m in the paper
+    spacing: metres between neighbouring nodes
+    """
+
+    size: float = 8.0
+    spacing: float = 0.0625
+
+    def __post_init__(self):
+        require_number("size", self.size, 0, 1000, "an edge length in metres, at most 1000")
+        require_number("spacing", self.spacing, 0, self.size, "a distance in metres, above 0 and at most the map's size")
+        cells = self.size / self.spacing
+        require(abs(cells - round(cells)) < 1e-6, "spacing", self.spacing, f"a whole fraction of the size {self.size:g} m")
+        require(round(cells) <= 4096, "spacing", self.spacing, "such that an edge has at most 4096 cells")
+
+    @property
+    def cells(self) -> int:
+        """Cells along one edge."""
+        return round(self.size / self.spacing)
+
+    @property
+    def nodes(self) -> int:
+        """Nodes along one edge, one more than cells: 129."""
+        return self.cells + 1
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, cols) of a map."""
+        return self.nodes, self.nodes
+
+    def axis(self) -> np.ndarray:
+        """Coordinates of the rows (y) or columns (x): [nodes] float64 metres."""
+        return (np.arange(self.nodes) - 0.5 * self.cells) * self.spacing

@@ -1,0 +1,222 @@
+"""Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2).
+
+A style and a seed give the parameters and the noise seed; these give the map. Plains and mountains are two noise fields,
+mixed by a third one: Z = plains * w + mountains * (1 - w). All three share one noise seed.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from travjax.batching import in_batches
+from travjax.config import InputError, require
+from travjax.grid import Grid
+from travjax.noise import SEEDS, noise_on_axes, permutation_table
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "perc_obstacles",
+        "smooth_transition",
+        "distribution_x",
+        "distribution_y",
+        "height_obstacles",
+        "smooth_mountains",
+        "smooth_plains",
+        "slopes_variation",
+        "max_slope_variation",
+    ],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class TerrainParams:
+    """Parameters of Algorithm 1: numbers for one map, [n] arrays for n maps.
+
+    perc_obstacles, smooth_transition: where the mixing noise (0 to 1) turns from mountains to plains, and how softly
+    distribution_x, distribution_y:    0 to 1, how often plains and mountains alternate along x and y
+    height_obstacles:                  metres, height of the mountains (negative: craters)
+    smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres on an M metre map
+    slopes_variation:                  exponent of the plains
+    max_slope_variation:               scale of the plains
+    """
+
+    perc_obstacles: Float[Array, "*n"]
+    smooth_transition: Float[Array, "*n"]
+    distribution_x: Float[Array, "*n"]
+    distribution_y: Float[Array, "*n"]
+    height_obstacles: Float[Array, "*n"]
+    smooth_mountains: Float[Array, "*n"]
+    smooth_plains: Float[Array, "*n"]
+    slopes_variation: Float[Array, "*n"]
+    max_slope_variation: Float[Array, "*n"]
+
+
+FIELDS = tuple(field.name for field in dataclasses.fields(TerrainParams))
+
+_CRATER = dict(
+    perc_obstacles=(0.15, 0.2),
+    smooth_transition=(0.2, 1),
+    distribution_x=(0.05, 0.1),
+    distribution_y=(0.05, 0.1),
+    smooth_mountains=(1, 6),
+    smooth_plains=(0.3, 1),
+    slopes_variation=(0.05, 0.5),
+    max_slope_variation=0.3,
+)
+_SMOOTH = dict(
+    perc_obstacles=(0.05, 0.1),
+    smooth_transition=0.3,
+    distribution_x=0.85,
+    distribution_y=0.85,
+    height_obstacles=0.5,
+    smooth_mountains=0.2,
+    smooth_plains=(0.4, 0.9),
+    slopes_variation=(0.08, 0.8),
+    max_slope_variation=(0.08, 0.4),
+)
+_ROUGH = dict(
+    perc_obstacles=(0.1, 0.15),
+    smooth_transition=0.1,
+    distribution_x=(0.7, 0.85),
+    distribution_y=(0.7, 0.85),
+    height_obstacles=(0.5, 1.5),
+    smooth_mountains=0.1,
+    smooth_plains=(0.03, 0.05),
+    slopes_variation=(0.03, 0.06),
+    max_slope_variation=(0.05, 0.5),
+)
+_WAVY = dict(
+    perc_obstacles=0.1,
+    smooth_transition=0.1,
+    distribution_x=0.7,
+    distribution_y=0.7,
+    height_obstacles=1,
+    smooth_mountains=0.1,
+    max_slope_variation=0.5,
+)
+_SHARP = dict(
+    perc_obstacles=(0.1, 0.17),
+    smooth_transition=0.3,
+    distribution_x=(0.85, 0.9),
+    distribution_y=(0.85, 0.9),
+    height_obstacles=(0.3, 2.5),
+    smooth_mountains=(0.1, 0.2),
+    smooth_plains=0.4,
+    slopes_variation=0.5,
+    max_slope_variation=0.4,
+)
+RANGES = {
+    "mountain_crater": (_CRATER | dict(height_obstacles=(2, 6)), _CRATER | dict(height_obstacles=(-6, -2))),
+    "smooth": (_SMOOTH, _SMOOTH),
+    "rough": (_ROUGH, _ROUGH),
+    "wavy": (
+        _WAVY | dict(smooth_plains=(0.3, 0.35), slopes_variation=(0.45, 0.55)),
+        _WAVY | dict(smooth_plains=(0.4, 0.7), slopes_variation=(0.8, 1)),
+    ),
+    "scattered_sharp": (_SHARP, _SHARP),
+}
+"""For each style the two halves of its maps: a number, or the ends of a uniform distribution (SPEC section 2)."""
+
+STYLES = tuple(RANGES)
+
+_LIMITS = np.array(
+    [[[np.broadcast_to(half[field], 2) for field in FIELDS] for half in halves] for halves in RANGES.values()], np.float32
+)
+"""[style, half, field, (low, high)]."""
+
+
+def generate_terrain(style: str | Sequence[str], seeds, *, grid: Grid = Grid()) -> Float[Array, "n rows cols"]:
+    """Maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
+
+    style: one of STYLES, or a sequence with one for each seed
+    seeds: integers in [0, 2^32): a sequence, a range or one number
+    Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1.
+    Raises InputError for an unknown style, no or bad seeds, or another number of styles than of seeds.
+    """
+    return elevation(*sample_params(style, seeds), grid=grid)
+
+
+def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, "n"]]:
+    """The parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and errors."""
+    numbers = np.atleast_1d(np.asarray(seeds))
+    require(numbers.ndim == 1 and len(numbers) > 0, "seeds", seeds, "one or more integers")
+    whole = np.issubdtype(numbers.dtype, np.integer) and numbers.min() >= 0 and numbers.max() < 2**32
+    require(bool(whole), "seeds", seeds, "integers from 0 to 4294967295")
+    styles = [style] * len(numbers) if isinstance(style, str) else list(style)
+    for name in set(styles):
+        require(name in STYLES, "style", name, f"one of {', '.join(STYLES)}")
+    require(len(styles) == len(numbers), "style", f"{len(styles)} styles for {len(numbers)} seeds", "one, or one a seed")
+    index = np.array([STYLES.index(name) for name in styles], np.uint32)
+    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbers.astype(np.uint32)))
+    return TerrainParams(*values.T), noise_seeds
+
+
+@jax.jit
+def _sample(style, seed):
+    def sample_one(style, seed):
+        key = jax.random.fold_in(jax.random.key(seed), style)
+        for_half, for_values, for_noise = jax.random.split(key, 3)
+        half = jax.random.bernoulli(for_half).astype(jnp.int32)
+        low, high = jnp.asarray(_LIMITS)[style, half].T
+        values = low + (high - low) * jax.random.uniform(for_values, (len(FIELDS),))
+        return values, jax.random.randint(for_noise, (), 0, SEEDS)
+
+    return jax.vmap(sample_one)(style, seed)
+
+
+def elevation(params: TerrainParams, noise_seed, *, grid: Grid = Grid()) -> Float[Array, "*n rows cols"]:
+    """Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
+
+    noise_seed: an integer in [0, 10000), or [n] of them
+    Raises InputError when the noise seed, or a parameter that shapes the noise, lies outside what is allowed.
+    """
+    seeds = np.asarray(noise_seed)
+    inside = np.issubdtype(seeds.dtype, np.integer) and seeds.size and seeds.min() >= 0 and seeds.max() < SEEDS
+    require(bool(inside), "noise_seed", noise_seed, f"an integer from 0 to {SEEDS - 1}")
+    values = [np.asarray(getattr(params, field), np.float32) for field in FIELDS]
+    for field, value in zip(FIELDS, values, strict=True):
+        if not np.isfinite(value).all():
+            raise InputError(f"{field} = {getattr(params, field)}: must be finite")
+        if field.startswith("distribution"):
+            require(bool((value >= 0).all() and (value <= 1).all()), field, getattr(params, field), "from 0 to 1")
+        elif field != "height_obstacles":
+            require(bool((value >= 0).all()), field, getattr(params, field), "at least 0")
+    shape = np.broadcast_shapes(seeds.shape, *(value.shape for value in values))
+    require(len(shape) < 2, "params", f"arrays of shape {shape}", "numbers or [n] arrays")
+    columns = [np.broadcast_to(value, shape).reshape(-1) for value in (*values, seeds.astype(np.int32))]
+    maps = in_batches(lambda batch: _elevation(*batch, permutation_table(), grid), (TerrainParams(*columns[:-1]), columns[-1]))
+    return maps if shape else maps[0]
+
+
+@partial(jax.jit, static_argnames="grid")
+def _elevation(params: TerrainParams, noise_seeds, permutations, grid: Grid):
+    return jax.vmap(lambda one, seed: _elevation_of_one(one, permutations[seed], grid))(params, noise_seeds)
+
+
+def _elevation_of_one(params: TerrainParams, permutation, grid: Grid) -> Float[Array, "rows cols"]:
+    axis = jnp.asarray(grid.axis(), jnp.float32)
+    smallest, largest = 1 / grid.size, grid.size
+
+    def noise(feature_x, feature_y):
+        reach = grid.size / 2 / smallest
+        return noise_on_axes(permutation, axis / feature_x, axis / feature_y, reach)
+
+    mix = (noise(*(largest - (largest - smallest) * d for d in (params.distribution_x, params.distribution_y))) + 1) / 2
+    start = params.perc_obstacles - 0.2 * params.smooth_transition
+    end = params.perc_obstacles + 0.2 * params.smooth_transition
+    weight = jnp.where(mix < start, 0.0, jnp.where(mix > end, 1.0, (mix - start) / (end - start)))
+
+    feature = (largest - smallest) * params.smooth_plains + smallest
+    base = jnp.maximum(noise(feature, feature) + 1, 0) * params.max_slope_variation * 0.15 * grid.size
+    plains = base**params.slopes_variation - 0.8
+
+    feature = (largest - smallest) * params.smooth_mountains + smallest
+    mountains = (noise(feature, feature) + 1) / 2 * params.height_obstacles
+    return plains * weight + mountains * (1 - weight)
