@@ -8,6 +8,8 @@ Arrays, frames and units are in the module docstrings: grid.py for maps, actions
 margins and failures.
 """
 
+from importlib.metadata import version
+
 from travjax.actions import ActionSpace
 from travjax.config import InputError
 from travjax.dem import load_dem
@@ -15,6 +17,8 @@ from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 from travjax.traverse import EVENTS, Margins, failures, label, simulate
+
+__version__ = version("travjax")
 
 __all__ = [
     "EVENTS",

@@ -6,6 +6,7 @@ heading anticlockwise from +y. The point turn itself is not simulated. Everythin
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -47,10 +48,17 @@ class ActionSpace:
         radii = isinstance(self.radii, tuple) and len(self.radii) > 0
         require(radii, "radii", self.radii, "a list of one or more radii in metres")
         for radius in self.radii:
-            number = isinstance(radius, int | float) and not isinstance(radius, bool)
-            require(number and radius != 0 and radius > -math.inf, "radii", radius, "a radius in metres, not 0; inf is straight")
+            number = isinstance(radius, Real) and not isinstance(radius, bool)
+            require(
+                number and radius != 0 and radius > -math.inf,
+                "radii",
+                radius,
+                "a radius in metres, not 0; inf is straight",
+            )
         require(len(set(self.radii)) == len(self.radii), "radii", self.radii, "different from each other")
-        require_number("interval", self.interval, 0, min(self.arc_lengths), "a length in metres, at most an arc's length")
+        require_number(
+            "interval", self.interval, 0, min(self.arc_lengths), "a length in metres, at most an arc's length"
+        )
 
     @staticmethod
     def load(path: str | Path) -> "ActionSpace":
@@ -76,7 +84,7 @@ class ActionSpace:
         return 2 * math.pi * np.asarray(turn) / self.turns
 
     def first_stations(self) -> np.ndarray:
-        """Path lengths of the poses along the first arc, the junction (start of the second arc) included: [29] metres."""
+        """Path lengths of the poses along the first arc, its junction with the second included: [29] metres."""
         return np.append(_stations(self.arc_lengths[0], self.interval), self.arc_lengths[0])
 
     def second_stations(self) -> np.ndarray:

@@ -13,8 +13,8 @@ BATCH = 32
 def in_batches(function: Callable[[Any], Any], items: Any) -> Any:
     """Applies `function` to batches of `items` and puts the results together.
 
-    items: a pytree of arrays with a common leading axis [n, ...]; so are the results. A batch is BATCH items, the last one
-    the power of two that holds the rest, filled up by repeating its first item.
+    items: a pytree of arrays with a common leading axis [n, ...]; so are the results. A batch is BATCH items, the last
+    one the power of two that holds the rest, filled up by repeating its first item.
     """
     count = len(jax.tree.leaves(items)[0])
     results = []

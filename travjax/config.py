@@ -7,8 +7,9 @@ ends in `_deg` holds degrees; everything else is named as the field is.
 import dataclasses
 import math
 import tomllib
+from numbers import Real
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, cast
 
 Config = TypeVar("Config")
 
@@ -25,8 +26,8 @@ def require(condition: bool, field: str, value: object, allowed: str) -> None:
 
 def require_number(field: str, value: object, low: float, high: float, allowed: str) -> None:
     """Raises InputError unless `value` is a finite number with low < value <= high."""
-    number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    require(number and low < value <= high, field, value, allowed)
+    number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    require(number and low < float(cast(float, value)) <= high, field, value, allowed)
 
 
 def load_toml(path: str | Path, kind: type[Config]) -> Config:

@@ -12,7 +12,7 @@ from travjax.config import InputError
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it becomes `path` when the block ends well, and is removed otherwise."""
+    """A temporary name beside `path` to write to; it becomes `path` when the block ends well, else it is removed."""
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         yield temporary
@@ -30,7 +30,9 @@ def output_folder(path: str | Path) -> Path:
         probe.touch()
         probe.unlink()
     except OSError as error:
-        raise InputError(f"--out {folder}: cannot be written: {error.strerror}; allowed: a folder you may write to") from None
+        raise InputError(
+            f"--out {folder}: cannot be written: {error.strerror}; allowed: a folder you may write to"
+        ) from None
     return folder
 
 

@@ -3,14 +3,15 @@
 Poses of the action space -> the node under each wheel and the nodes under the chassis, as NumPy arrays that depend on
 robot geometry, action space and grid only (SPEC sections 4 and 5). Everything is computed in float64.
 
-An even number of point turns maps the action space onto itself when the map is turned by 180 degrees, and a set of radii
-that comes in +- pairs does so when the map is mirrored. Tables are then needed for one arc of each orbit only, and the
-kernel simulates it on the map and on its turned and mirrored images side by side (the "views" below).
+An even number of point turns maps the action space onto itself when the map is turned by 180 degrees, and a set of
+radii that comes in +- pairs does so when the map is mirrored. Tables are then needed for one arc of each orbit only,
+and the kernel simulates it on the map and on its turned and mirrored images side by side (the "views" below).
 """
 
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 
@@ -75,10 +76,8 @@ class NodeTable:
     centre:  [F, P] int32 node nearest to the robot's centre, in the view
     offset:  [F, P, 2] float32 centre minus that node, (x, y) in cells
     axes:    [F, P, 2] float32 cos and sin of the heading
-    runs:    [F, P, 2, K] int8 or int16 (row, col) from `centre` to the first of RUN neighbouring chassis nodes
-    singles: [F, P, 2, M] the same for chassis nodes one by one: those that are in no run
-    every:   [F, P, 2, N] the same for all chassis nodes one by one
-             (unused places repeat another one of the same pose)
+    chassis: [F, P, 3, rows] int16 (row, first column, number of columns) of the nodes under the chassis, row by row,
+             rows and columns counted from `centre`
     source:  [T] int32 position of every trajectory in results flattened from [F, R, V]
     """
 
@@ -86,16 +85,14 @@ class NodeTable:
     centre: np.ndarray
     offset: np.ndarray
     axes: np.ndarray
-    runs: np.ndarray
-    singles: np.ndarray
-    every: np.ndarray
+    chassis: np.ndarray
     source: np.ndarray
     layout: Layout
 
 
 @lru_cache(maxsize=8)
 def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
-    """Builds the table (0.4 s for the defaults, so it is not kept on disk).
+    """Builds the table (0.1 s for the defaults, so it is not kept on disk).
 
     Raises InputError when a radius turns inside the robot or a trajectory leaves the map.
     """
@@ -108,16 +105,14 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     flat = poses.reshape(-1, 3)
     row, start, count = _chassis_rows(flat, robot, grid)
     centre = np.floor(flat[:, 1::-1] / grid.spacing + grid.cells / 2 + 0.5).astype(np.int32)
-    row, start = row - centre[:, :1], start - centre[:, 1:]
+    chassis = np.stack([row - centre[:, :1], start - centre[:, 1:], count], axis=1).astype(np.int16)
     by_arc = lambda array: np.ascontiguousarray(array).reshape(*poses.shape[:2], *array.shape[1:])
     return NodeTable(
         wheels=_wheel_nodes(actions, views, turn, first, robot, grid),
         centre=by_arc(centre[:, 0] * grid.nodes + centre[:, 1]),
         offset=by_arc((flat[:, :2] / grid.spacing + grid.cells / 2 - centre[:, ::-1]).astype(np.float32)),
         axes=by_arc(np.stack([np.cos(flat[:, 2]), np.sin(flat[:, 2])], axis=-1).astype(np.float32)),
-        runs=by_arc(_places(row, start, np.where(count >= RUN, count, 0), RUN)),
-        singles=by_arc(_places(row, start, np.where(count < RUN, count, 0), 1)),
-        every=by_arc(_places(row, start, count, 1)),
+        chassis=by_arc(chassis),
         source=_source(actions, views, turn, first),
         layout=Layout(grid, views, poses.shape[1], len(actions.first_stations()), len(actions.radii)),
     )
@@ -144,13 +139,14 @@ def _views(actions: ActionSpace) -> tuple[View, ...]:
 
 def _first_arcs(actions: ActionSpace, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
     """One (turn, first radius) of each orbit under the views: [F] each."""
-    seen, chosen = set(), []
-    for arc in np.ndindex(actions.turns, len(actions.radii)):
-        if arc not in seen:
-            chosen.append(arc)
-            seen.update((int(t), int(f)) for t, f in (view.arc(*arc, actions) for view in views))
-    turn, first = np.array(chosen).T
-    return turn, first
+    seen: set[tuple[int, int]] = set()
+    chosen = []
+    for turn, first in product(range(actions.turns), range(len(actions.radii))):
+        if (turn, first) not in seen:
+            chosen.append((turn, first))
+            seen.update((int(t), int(f)) for t, f in (view.arc(turn, first, actions) for view in views))
+    turns, firsts = np.array(chosen).T
+    return turns, firsts
 
 
 def _source(actions: ActionSpace, views: tuple[View, ...], turn: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -169,7 +165,8 @@ def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.nd
     right, forward = np.array(robot.wheel_positions()).T
     nodes = []
     for view in views:
-        poses = _poses(actions, *view.arc(turn, first, actions), view.second(np.arange(len(actions.radii)), actions))
+        true_turn, true_first = view.arc(turn, first, actions)
+        poses = _poses(actions, true_turn, true_first, view.second(np.arange(len(actions.radii)), actions))
         x, y, heading = (poses[..., axis, None] for axis in range(3))
         sin, cos, aside = np.sin(heading), np.cos(heading), -right if view.mirrored else right
         col = _nearest(x + cos * aside - sin * forward, grid)
@@ -197,6 +194,12 @@ def _chassis_rows(poses: np.ndarray, robot: Robot, grid: Grid) -> tuple[np.ndarr
     start = np.ceil((x + np.maximum(low_u, low_v)) / grid.spacing + grid.cells / 2).astype(int)
     stop = np.floor((x + np.minimum(high_u, high_v)) / grid.spacing + grid.cells / 2).astype(int)
     count = np.maximum(stop - start + 1, 0)
+    bare = ~count.any(axis=1)
+    if bare.any():
+        raise InputError(
+            f"spacing = {grid.spacing:g}: too coarse for {robot.name}, no node under its chassis at "
+            f"{bare.sum()} poses; allowed: up to {min(robot.chassis_width, robot.chassis_length) / math.sqrt(2):.3g} m"
+        )
     _check_inside(row[count > 0], np.concatenate([start[count > 0], stop[count > 0]]), grid)
     return row, start, count
 
@@ -217,24 +220,39 @@ def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid) -> None:
         )
 
 
-def _places(row: np.ndarray, start: np.ndarray, count: np.ndarray, run: int) -> np.ndarray:
-    """Covers the column intervals [start, start + count) of every pose by places of `run` neighbouring nodes.
+def chassis_places(chassis: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
+    """Covers the chassis nodes of every pose by runs of `run` neighbours in a row, and single nodes where none fits.
 
-    row, start, count: [P, rows] with count 0 or at least run. Returns [P, 2, K] (row, col) of each place's first node.
-    The last place of an interval may overlap the one before; unused places repeat the pose's first one.
+    chassis: [F, P, 3, rows] as in NodeTable. Returns (runs [F, P, 2, K], singles [F, P, 2, M]), each the (row, column)
+    of a run's first node or of a single one; runs of a row may overlap, and a place that a pose does not need repeats
+    another one of its own. All nodes are single (K = 0) when `run` is 1 or some pose has no row that wide.
     """
+    flat = chassis.reshape(-1, 3, chassis.shape[-1])
+    row, start, count = flat.transpose(1, 0, 2)
+    fits = np.asarray(count >= run)
+    fits &= run > 1 and fits.any(axis=1).all()
+    runs, singles = _places(row, start, np.where(fits, count, 0), run), _places(row, start, np.where(fits, 0, count), 1)
+    anywhere = np.take_along_axis(flat[:, :2], np.argmax(count > 0, axis=1)[:, None, None], axis=2)
+    narrow = np.where(fits, 0, count).any(axis=1, keepdims=True)
+    singles = np.where(narrow[..., None], singles, anywhere.astype(singles.dtype))
+    return runs.reshape(*chassis.shape[:2], 2, -1), singles.reshape(*chassis.shape[:2], 2, -1)
+
+
+def _places(row: np.ndarray, start: np.ndarray, count: np.ndarray, run: int) -> np.ndarray:
+    """Places of `run` columns that cover [start, start + count) in each row: [P, 2, K] for [P, rows] arrays."""
     places = -(-count // run)
     used = places.sum(axis=1)
-    table = np.zeros((len(row), 2, used.max()), int)
+    table = np.zeros((2, len(row), used.max()), np.int16)
+    pose, line = np.nonzero(places)
+    repeats = places[pose, line]
+    within = np.minimum(_counting(repeats) * run, np.repeat(count[pose, line] - run, repeats))
+    slot = np.repeat(pose, repeats), _counting(used)
+    table[0][slot] = np.repeat(row[pose, line], repeats)
+    table[1][slot] = np.repeat(start[pose, line], repeats) + within
     if used.max():
-        pose, line = np.nonzero(places)
-        repeats = places[pose, line]
-        step = _counting(repeats)
-        pose, line = np.repeat(pose, repeats), np.repeat(line, repeats)
-        col = start[pose, line] + np.minimum(step * run, count[pose, line] - run)
-        table[pose, :, _counting(used)] = np.stack([row[pose, line], col], axis=-1)
-        table = np.where(np.arange(used.max()) < used[:, None, None], table, table[:, :, :1])
-    return table.astype(np.int8 if np.abs(table).max(initial=0) < 128 else np.int16)
+        table = np.where(np.arange(used.max()) < used[:, None], table, table[:, :, :1])
+    small = np.abs(table).max(initial=0) < 128
+    return table.astype(np.int8 if small else np.int16).transpose(1, 0, 2)
 
 
 def _counting(lengths: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """The node grid of an elevation map (SPEC section 1).
 
-`heights[row, col]` stands at y = -size/2 + spacing * row (forward, north) and x = -size/2 + spacing * col (right, east);
-the robot starts at (0, 0) and faces +y.
+`heights[row, col]` stands at y = -size/2 + spacing * row (forward, north), x = -size/2 + spacing * col (right, east).
+The robot starts at (0, 0) and faces +y.
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,13 @@ class Grid:
 
     def __post_init__(self):
         require_number("size", self.size, 0, 1000, "an edge length in metres, at most 1000")
-        require_number("spacing", self.spacing, 0, self.size, "a distance in metres, above 0 and at most the map's size")
+        require_number(
+            "spacing", self.spacing, 0, self.size, "a distance in metres, above 0 and at most the map's size"
+        )
         cells = self.size / self.spacing
-        require(abs(cells - round(cells)) < 1e-6, "spacing", self.spacing, f"a whole fraction of the size {self.size:g} m")
+        require(
+            abs(cells - round(cells)) < 1e-6, "spacing", self.spacing, f"a whole fraction of the size {self.size:g} m"
+        )
         require(round(cells) <= 4096, "spacing", self.spacing, "such that an edge has at most 4096 cells")
 
     @property

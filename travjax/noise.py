@@ -1,8 +1,8 @@
 """OpenSimplex 2D noise in JAX, the same function as the `opensimplex` package (the 2014 algorithm).
 
-The plane is skewed so that a triangular lattice becomes a square one. Every lattice vertex within sqrt(2) of a point adds
-(2 - d^2)^4 (g . d), with d the vector from the vertex and g one of eight gradients that a permutation of 256 picks. Such
-a point lies in one lattice cell, and five vertices at most can reach it: the cell's corners and one vertex outside. The
+The plane is skewed so that a triangular lattice becomes a square one. Every lattice vertex within sqrt(2) of a point
+adds (2 - d^2)^4 (g . d), with d the vector from the vertex and g one of eight gradients that a permutation of 256
+picks. A point lies in one lattice cell, and five vertices at most can reach it: the cell's corners and one outside. The
 gradients of all eight vertices around a cell are packed in one integer, so that a point reads memory once.
 """
 
@@ -48,7 +48,8 @@ def permutations(seeds) -> np.ndarray:
 @lru_cache(maxsize=1)
 def permutation_table() -> jax.Array:
     """Permutations of all terrain seeds, on the device: [SEEDS, 256] uint8."""
-    return jax.device_put(permutations(np.arange(SEEDS)))
+    with jax.ensure_compile_time_eval():  # an array, and no tracer, when the caller is being traced
+        return jnp.asarray(permutations(np.arange(SEEDS)))
 
 
 def noise2(seed, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "..."]:
@@ -57,8 +58,12 @@ def noise2(seed, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "
     Agrees with `OpenSimplex(seed).noise2` to 1e-5 where |x|, |y| < 32. Raises InputError unless the seeds are integers.
     """
     seeds = np.asarray(seed)
-    require(np.issubdtype(seeds.dtype, np.integer) and seeds.ndim < 2, "seed", seed, "an integer, or a list of integers")
-    value = _noise_of_permutations(permutations(np.atleast_1d(seeds)), jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32))
+    require(
+        np.issubdtype(seeds.dtype, np.integer) and seeds.ndim < 2, "seed", seed, "an integer, or a list of integers"
+    )
+    value = _noise_of_permutations(
+        permutations(np.atleast_1d(seeds)), jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
+    )
     return value[0] if seeds.ndim == 0 else value
 
 
@@ -67,7 +72,7 @@ def _noise_of_permutations(tables, x, y):
     return jax.vmap(lambda table: noise_at(x, y, lambda i, j: cell_codes(table, i, j)))(tables)
 
 
-def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, "cols"], y: Float[Array, "rows"], reach: float):
+def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, " cols"], y: Float[Array, " rows"], reach: float):
     """Noise on the grid of the axes x and y, all within [-reach, reach]: [rows, cols].
 
     Codes of the lattice cells are computed first where they are fewer than the points.

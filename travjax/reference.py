@@ -83,9 +83,7 @@ def _along_arc(start: np.ndarray, radius: float, distances: np.ndarray) -> np.nd
     return np.stack([east, north, heading + turned], axis=1)
 
 
-def simulate_trajectory(
-    heights, robot, actions, trajectory: int, cell_size: float = 0.0625
-) -> TrajectoryMargins:
+def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: float = 0.0625) -> TrajectoryMargins:
     """Margins of one trajectory on one map (section 5).
 
     heights: [rows, cols] metres, both odd, the centre node at x = y = 0; NaN is unknown ground.
@@ -164,9 +162,7 @@ def _pose_plane(contacts: list[float], robot) -> tuple[float, float, float]:
     return centre, roll_slope, pitch_slope
 
 
-def _highest_above_plane(
-    heights, robot, plane, x: float, y: float, heading: float, cell_size: float
-) -> float:
+def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: float, cell_size: float) -> float:
     """Largest height above the pose plane of the nodes under the chassis; NaN if one of them is unknown."""
     sin, cos = math.sin(heading), math.cos(heading)
     radius = _circumradius(robot)
@@ -196,7 +192,7 @@ def simulate(
     actions,
     trajectories: Iterable[int] | None = None,
     cell_size: float = 0.0625,
-    on_progress: Callable[[int], None] | None = None,
+    on_progress: Callable[[int], object] | None = None,
 ) -> Margins:
     """Margins of the trajectories asked for (all unless given), one after the other, on one map (section 5).
 

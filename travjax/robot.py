@@ -42,7 +42,9 @@ class Robot:
         require(isinstance(self.name, str) and bool(self.name), "name", self.name, "a non-empty text")
         for field in fields(self):
             if field.name not in ("name", "max_tilt"):
-                require_number(field.name, getattr(self, field.name), 0, 100, "a length in metres, above 0 and at most 100")
+                require_number(
+                    field.name, getattr(self, field.name), 0, 100, "a length in metres, above 0 and at most 100"
+                )
         require_number("max_tilt", self.max_tilt, 0, math.pi / 2, "an angle above 0 and at most 90 degrees (pi/2 rad)")
 
     @staticmethod
@@ -56,7 +58,9 @@ class Robot:
         if Path(source).suffix == ".toml":
             return load_toml(source, Robot)
         if str(source) not in Robot.presets():
-            raise InputError(f"robot {str(source)!r}: no such preset; allowed: {', '.join(Robot.presets())}, or a .toml file")
+            raise InputError(
+                f"robot {str(source)!r}: no such preset; allowed: {', '.join(Robot.presets())}, or a .toml file"
+            )
         return load_toml(PRESETS / f"{source}.toml", Robot)
 
     @staticmethod

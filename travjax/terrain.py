@@ -1,13 +1,14 @@
 """Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2).
 
-A style and a seed give the parameters and the noise seed; these give the map. Plains and mountains are two noise fields,
-mixed by a third one: Z = plains * w + mountains * (1 - w). All three share one noise seed.
+A style and a seed give the parameters and the noise seed; these give the map. Plains and mountains are two noise
+fields, mixed by a third one: Z = plains * w + mountains * (1 - w). All three share one noise seed.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +113,7 @@ _SHARP = dict(
     slopes_variation=0.5,
     max_slope_variation=0.4,
 )
-RANGES = {
+RANGES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "mountain_crater": (_CRATER | dict(height_obstacles=(2, 6)), _CRATER | dict(height_obstacles=(-6, -2))),
     "smooth": (_SMOOTH, _SMOOTH),
     "rough": (_ROUGH, _ROUGH),
@@ -127,7 +128,8 @@ RANGES = {
 STYLES = tuple(RANGES)
 
 _LIMITS = np.array(
-    [[[np.broadcast_to(half[field], 2) for field in FIELDS] for half in halves] for halves in RANGES.values()], np.float32
+    [[[np.broadcast_to(half[field], 2) for field in FIELDS] for half in halves] for halves in RANGES.values()],
+    np.float32,
 )
 """[style, half, field, (low, high)]."""
 
@@ -143,7 +145,7 @@ def generate_terrain(style: str | Sequence[str], seeds, *, grid: Grid = Grid()) 
     return elevation(*sample_params(style, seeds), grid=grid)
 
 
-def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, "n"]]:
+def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, " n"]]:
     """The parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and errors."""
     numbers = np.atleast_1d(np.asarray(seeds))
     require(numbers.ndim == 1 and len(numbers) > 0, "seeds", seeds, "one or more integers")
@@ -152,7 +154,9 @@ def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int
     styles = [style] * len(numbers) if isinstance(style, str) else list(style)
     for name in set(styles):
         require(name in STYLES, "style", name, f"one of {', '.join(STYLES)}")
-    require(len(styles) == len(numbers), "style", f"{len(styles)} styles for {len(numbers)} seeds", "one, or one a seed")
+    require(
+        len(styles) == len(numbers), "style", f"{len(styles)} styles for {len(numbers)} seeds", "one, or one a seed"
+    )
     index = np.array([STYLES.index(name) for name in styles], np.uint32)
     values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbers.astype(np.uint32)))
     return TerrainParams(*values.T), noise_seeds
@@ -190,8 +194,9 @@ def elevation(params: TerrainParams, noise_seed, *, grid: Grid = Grid()) -> Floa
             require(bool((value >= 0).all()), field, getattr(params, field), "at least 0")
     shape = np.broadcast_shapes(seeds.shape, *(value.shape for value in values))
     require(len(shape) < 2, "params", f"arrays of shape {shape}", "numbers or [n] arrays")
-    columns = [np.broadcast_to(value, shape).reshape(-1) for value in (*values, seeds.astype(np.int32))]
-    maps = in_batches(lambda batch: _elevation(*batch, permutation_table(), grid), (TerrainParams(*columns[:-1]), columns[-1]))
+    columns = [jnp.asarray(np.broadcast_to(value, shape).reshape(-1)) for value in (*values, seeds.astype(np.int32))]
+    batched = (TerrainParams(*columns[:-1]), columns[-1])
+    maps = in_batches(lambda batch: _elevation(*batch, permutation_table(), grid), batched)
     return maps if shape else maps[0]
 
 

@@ -15,12 +15,12 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, UInt8
 
 from travjax.actions import ActionSpace
 from travjax.batching import in_batches
 from travjax.config import InputError
-from travjax.footprint import RUN, Layout, View, node_table
+from travjax.footprint import RUN, Layout, View, chassis_places, node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 
@@ -34,6 +34,9 @@ CHUNK = 200_000
 
 PLACES = 8
 """Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
+
+HIGHEST = 30_000.0
+"""Metres: larger heights are none."""
 
 UNKNOWN = 1e30
 """Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
@@ -75,8 +78,8 @@ def simulate(
 ) -> Margins:
     """Margins of every trajectory on every map.
 
-    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown; laid out as in grid.py. float64 NumPy heights are taken
-             relative to the map's centre before they become float32, so a site at 2000 m loses nothing
+    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown; laid out as in grid.py. float64 NumPy heights are
+             taken relative to the map's centre before they become float32, so a site at 2000 m loses nothing
     robot, actions: Seekur Jr and the paper's action space unless given
     Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
     Raises InputError when heights have another shape than the grid or are not numbers, and when a trajectory leaves the
@@ -84,11 +87,11 @@ def simulate(
     """
     robot, actions = robot or default_robot(), actions or ActionSpace()
     maps = as_maps(heights, grid)
-    table = node_table(robot, actions, grid)
+    layout = node_table(robot, actions, grid).layout
 
     def simulate_batch(batch: jax.Array) -> Margins:
-        chunks, source = _device_tables(robot, actions, grid, _arcs_at_once(len(batch), table.layout, len(table.centre)))
-        return _simulate(batch, chunks, source, robot.wheelbase, robot.track, table.layout)
+        chunks, source = _device_tables(robot, actions, grid, len(batch))
+        return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout)
 
     margins = in_batches(simulate_batch, maps)
     return jax.tree.map(lambda margin: margin[0], margins) if np.ndim(heights) == 2 else margins
@@ -113,8 +116,23 @@ def label(
     return failures(simulate(heights, robot, actions, grid=grid), robot)
 
 
+def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
+    """Labels in one byte a trajectory: bits 0 to 2 the failures in the order of EVENTS, bit 3 unknown."""
+    bits = jnp.concatenate([failed, ~known[..., None]], axis=-1)
+    return (bits << jnp.arange(4)).sum(axis=-1).astype(jnp.uint8)
+
+
+def unpacked(labels: UInt8[Array, "*n t"]) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
+    """The (failed, known) that `packed` was given."""
+    bits = (labels[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
+    return bits[..., :3].astype(bool), bits[..., 3] == 0
+
+
 def as_maps(heights, grid: Grid) -> Float[Array, "n rows cols"]:
-    """Checked float32 maps with a leading axis; float64 NumPy heights relative to each map's centre."""
+    """Checked float32 maps with a leading axis; float64 NumPy heights relative to each map's centre.
+
+    Heights of a jax array are not looked at: that would wait for the device.
+    """
     if not isinstance(heights, jax.Array):
         heights = np.asarray(heights)
     if heights.dtype == bool or not jnp.issubdtype(heights.dtype, jnp.number) or np.iscomplexobj(heights):
@@ -127,28 +145,28 @@ def as_maps(heights, grid: Grid) -> Float[Array, "n rows cols"]:
     if heights.size == 0:
         raise InputError("heights: zero maps: must be at least one")
     maps = heights.reshape(-1, *grid.shape)
+    if isinstance(maps, np.ndarray) and not (np.isnan(maps) | (np.abs(maps) <= HIGHEST)).all():
+        bad = maps[~(np.isnan(maps) | (np.abs(maps) <= HIGHEST))][0]
+        raise InputError(
+            f"heights = {bad:g}: must be metres between {-HIGHEST:g} and {HIGHEST:g}, or NaN where unknown"
+        )
     if isinstance(maps, np.ndarray) and maps.dtype != np.float32:
         maps = maps.astype(np.float64)
         maps = maps - maps[:, grid.cells // 2, grid.cells // 2, None, None]
     return jnp.asarray(maps, jnp.float32)
 
 
-def _arcs_at_once(maps: int, layout: Layout, arcs: int) -> int:
-    lanes = maps * len(layout.views)
-    return min(arcs, max(1, round(CHUNK / lanes / layout.poses)))
-
-
 @partial(
     jax.tree_util.register_dataclass,
-    data_fields=["wheels", "centre", "offset", "axes", "runs", "singles", "every"],
+    data_fields=["wheels", "centre", "offset", "axes", "runs", "singles"],
     meta_fields=[],
 )
 @dataclass(frozen=True)
 class _Chunks:
     """The pose arrays of a NodeTable cut into C chunks of A first arcs, laid out in the order in which they are read.
 
-    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles, every: [C, K / k, A P, 2, k] for k places
-    in one step of the kernel's scan.
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, K / k, A P, 2, k] for k places in
+    one step of the kernel's scan.
     """
 
     wheels: jax.Array
@@ -157,38 +175,40 @@ class _Chunks:
     axes: jax.Array
     runs: jax.Array
     singles: jax.Array
-    every: jax.Array
 
 
 @lru_cache(maxsize=8)
-def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, arcs: int) -> tuple[_Chunks, jax.Array]:
-    """The chunks and the `source` of a NodeTable, on the device."""
+def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
+    """The chunks for batches of `maps` and the `source` of a NodeTable, on the device."""
     table = node_table(robot, actions, grid)
+    runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
+    poses = maps * len(table.layout.views) * table.layout.poses
+    arcs = min(len(table.centre), max(1, round(CHUNK / poses)))
     padding = -len(table.centre) % arcs
 
     def cut(array):
         array = np.concatenate([array, array[:1].repeat(padding, axis=0)])
-        return array.reshape(-1, arcs * array.shape[1], *array.shape[2:])
+        return array.reshape(len(array) // arcs, arcs * array.shape[1], *array.shape[2:])
 
-    chunks = _Chunks(
-        wheels=cut(table.wheels).transpose(0, 2, 1, 3),
-        centre=cut(table.centre),
-        offset=cut(table.offset),
-        axes=cut(table.axes),
-        runs=_scan_order(cut(table.runs)),
-        singles=_scan_order(cut(table.singles)),
-        every=_scan_order(cut(table.every)),
-    )
-    return jax.device_put((chunks, table.source))
+    with jax.ensure_compile_time_eval():  # arrays, and no tracers, when the caller is being traced
+        chunks = _Chunks(
+            wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
+            centre=jnp.asarray(cut(table.centre)),
+            offset=jnp.asarray(cut(table.offset)),
+            axes=jnp.asarray(cut(table.axes)),
+            runs=jnp.asarray(_scan_order(cut(runs))),
+            singles=jnp.asarray(_scan_order(cut(singles))),
+        )
+        return chunks, jnp.asarray(table.source)
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
     """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near PLACES."""
     chunks, poses, _, count = places.shape
-    steps = max(1, round(count / PLACES))
-    repeated = np.repeat(places[..., :1], -count % steps, axis=-1)
-    places = np.concatenate([places, repeated], axis=-1)
-    return np.ascontiguousarray(places.reshape(chunks, poses, 2, steps, -1).transpose(0, 3, 1, 2, 4))
+    steps = -(-count // PLACES)
+    places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
+    each = places.shape[-1] // max(steps, 1)
+    return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
 
 
 @partial(jax.jit, static_argnames="layout")
@@ -199,19 +219,19 @@ def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -
     # Without these barriers XLA computes both anew for every element that is gathered from them.
     by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)
     views = jax.lax.optimization_barrier(_view_lanes(by_node, layout.views, grid))
-    run = RUN if len(maps) <= FEW_MAPS else 1
 
     def simulate_chunk(chunk: _Chunks) -> jax.Array:
         contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
         plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
-        obstacle = _highest_above(views, plane, chunk, run, grid.nodes)
+        obstacle = _highest_above(views, plane, chunk, grid.nodes)
         return _arc_maxima(contact, plane.slope, obstacle, layout)
 
     maxima = jax.lax.map(simulate_chunk, chunks).transpose(1, 0, 2, 3, 4).reshape(4, -1, len(maps))
     step, slope, obstacle, contact = maxima[:, source].transpose(0, 2, 1)
     known = (contact < UNKNOWN / 2) & (obstacle < UNKNOWN / 2)
     tilt = jnp.arctan(jnp.sqrt(slope))
-    return Margins(*(jnp.where(known, margin, jnp.nan) for margin in (step, obstacle, tilt)), known)
+    step, obstacle, tilt = (jnp.where(known, margin, jnp.nan) for margin in (step, obstacle, tilt))
+    return Margins(step, obstacle, tilt, known)
 
 
 def _view_lanes(by_node: jax.Array, views: tuple[View, ...], grid: Grid) -> jax.Array:
@@ -252,14 +272,13 @@ def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: 
     return _Planes(*jax.lax.optimization_barrier((level, east, north, pitch**2 + roll**2)))
 
 
-def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, run: int, cols: int) -> jax.Array:
+def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
     """Largest height of a chassis node above the pose plane: [P, lanes]."""
-    if run == 1:
-        return _scan_places(views, plane, chunk.centre, chunk.every, 1, cols)
-    in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, run, cols)
-    lanes = views.shape[1]
-    in_runs = reduce(_larger, [in_runs[:, k * lanes : (k + 1) * lanes] for k in range(run)])
-    return _larger(in_runs, _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols))
+    highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
+    if not len(chunk.runs):
+        return highest
+    in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, RUN, cols)
+    return reduce(_larger, jnp.split(in_runs, RUN, axis=1), highest)
 
 
 def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
@@ -281,7 +300,10 @@ def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> 
 
 
 def _arc_maxima(contact: jax.Array, slope: jax.Array, obstacle: jax.Array, layout: Layout) -> jax.Array:
-    """Maxima of (step, slope, obstacle, contact) over the poses of A first arcs and each second arc: [4, A, R, lanes]."""
+    """Maxima of (step, slope, obstacle, contact) over the poses of each of A first arcs and R second arcs.
+
+    Returns [4, A, R, lanes].
+    """
 
     def poses(field):
         """One array for each pose along the arcs: [..., A, 1, lanes] on the first, [..., A, R, lanes] on the second."""

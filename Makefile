@@ -1,0 +1,55 @@
+# `make label` and `make test` do everything on a fresh machine; `make help` lists the rest.
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= runs
+TRAVJAX_DATA ?= $(wildcard ../shared/data)
+YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
+export TRAVJAX_DATA
+
+.DEFAULT_GOAL := help
+.PHONY: help setup label test check bench clean
+
+help:
+	@echo "make setup   create $(VENV) with everything that the other targets need"
+	@echo "make label   make and label 200 synthetic maps and the Mars Yard, into $(OUT)/label"
+	@echo "make test    run the tests"
+	@echo "make check   lint, types and layering"
+	@echo "make bench   measure speed, into $(OUT)/bench"
+	@echo "make clean   remove $(VENV), $(OUT) and caches"
+
+setup: $(VENV)/.ready
+
+# Names are no proof: a pyenv shim called python3.13 may run nothing.
+$(VENV)/.ready: pyproject.toml constraints.txt
+	@for python in $(PYTHON) python3 python3.13 python3.12 python3.11 python; do \
+	  if $$python -c 'import ensurepip, sys, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; \
+	  then found=$$python; break; fi; done; \
+	if [ -z "$$found" ]; then \
+	  echo "make: no Python 3.11, 3.12 or 3.13 with venv and ensurepip runs here; install one, or name it: make PYTHON=..." >&2; \
+	  exit 2; fi; \
+	rm -rf $(VENV) && $$found -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+label: setup
+	$(BIN)/travjax label --count 200 --seed 0 --out $(OUT)/label/synthetic
+	@if [ -f "$(YARD)" ]; then \
+	  $(BIN)/travjax label "$(YARD)" --out $(OUT)/label/mars_yard; \
+	else \
+	  echo "No Mars Yard: terrain/mars_yard.tif is not under TRAVJAX_DATA='$(TRAVJAX_DATA)'; only synthetic maps were labelled."; \
+	fi
+
+test: setup
+	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+check: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q tests/test_layering.py
+
+bench: setup
+	$(BIN)/travjax bench --out $(OUT)/bench
+
+clean:
+	rm -rf $(VENV) $(OUT) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

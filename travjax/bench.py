@@ -1,0 +1,122 @@
+"""How fast: terrain and labelling for several batch sizes, beside the sequential simulator, in one run.
+
+Medians of repeated calls on compiled code, compile time apart. `travjax bench` prints the table and writes it as TSV.
+"""
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from travjax import reference
+from travjax.actions import ActionSpace
+from travjax.grid import Grid
+from travjax.robot import Robot
+from travjax.terrain import STYLES, generate_terrain
+from travjax.traverse import failures, packed, simulate
+
+COLUMNS = {
+    "what": "what",
+    "maps": "maps at once",
+    "ms_per_map": "ms a map",
+    "trajectories_per_s": "trajectories/s",
+    "first_call_s": "first call s (compiles)",
+    "repeats": "repeats",
+    "peak_mib": "peak memory MiB",
+}
+
+BATCHES = (1, 8, 32, 128)
+STREAM_CHUNK = 320
+
+
+def machine() -> str:
+    """The device and versions that a figure belongs to, in one line."""
+    device = jax.devices()[0]
+    versions = f"jax {jax.__version__}, Python {platform.python_version()}"
+    return f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
+
+
+def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
+    """Terrain and labelling on compiled code, a row for each batch size."""
+    for maps in BATCHES:
+        styles, seeds = _mixture(0, maps)
+        make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
+        yield _timed("terrain", maps, make, repeats, 0)
+    for maps in BATCHES:
+        heights = generate_terrain(*_mixture(0, maps), grid=grid)
+        heights = heights[0] if maps == 1 else heights
+        run = lambda heights=heights: simulate(heights, robot, actions, grid=grid)
+        yield _timed("labelling", maps, run, repeats, len(actions))
+
+
+def reference_row(robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
+    """One whole map by the sequential simulator, one trajectory after the other."""
+    heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
+    start = time.perf_counter()
+    reference.simulate(heights, robot, actions, cell_size=grid.spacing, on_progress=on_progress)
+    return _row("sequential NumPy simulator", 1, time.perf_counter() - start, len(actions), None, 1)
+
+
+def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
+    """Generates and labels that many maps, streamed in chunks, the labels kept in memory, one byte a trajectory."""
+    labels = np.empty((maps, len(actions)), np.uint8)
+    start = time.perf_counter()
+    for first in range(0, maps, STREAM_CHUNK):
+        count = min(STREAM_CHUNK, maps - first)
+        heights = generate_terrain(*_mixture(first, count), grid=grid)
+        margins = simulate(heights, robot, actions, grid=grid)
+        labels[first : first + count] = packed(failures(margins, robot), margins.known)
+        on_progress(count)
+    return _row("terrain and labelling, streamed", maps, time.perf_counter() - start, len(actions), None, 1)
+
+
+def start_row() -> dict:
+    """A new process from its start to the labels of one map, with the compilation cache filled by an earlier one."""
+    seconds = []
+    for _ in range(4):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            command = [sys.executable, "-m", "travjax", "label", "--count", "1", "--no-figures", "--out", folder]
+            subprocess.run(command, check=True, capture_output=True)
+            seconds.append(time.perf_counter() - start)
+    return _row("command line, start to labels", 1, statistics.median(seconds[1:]), 0, seconds[0], 3)
+
+
+def write_tsv(rows: list[dict], path: Path) -> None:
+    """One line for each row, the keys of COLUMNS as header."""
+    lines = ["\t".join("" if row[key] is None else str(row[key]) for key in COLUMNS) for row in rows]
+    path.write_text("\n".join(["\t".join(COLUMNS), *lines]) + "\n")
+
+
+def _mixture(first: int, count: int) -> tuple[list[str], range]:
+    return [STYLES[number % len(STYLES)] for number in range(first, first + count)], range(first, first + count)
+
+
+def _timed(what: str, maps: int, run: Callable[[], object], repeats: int, trajectories: int) -> dict:
+    seconds = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - start)
+    return _row(what, maps, statistics.median(seconds[1:]), trajectories, seconds[0], repeats)
+
+
+def _row(what: str, maps: int, seconds: float, trajectories: int, first: float | None, repeats: int) -> dict:
+    return {
+        "what": what,
+        "maps": maps,
+        "ms_per_map": seconds / maps * 1e3,
+        "trajectories_per_s": maps * trajectories / seconds if trajectories else None,
+        "first_call_s": first,
+        "repeats": repeats,
+        "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    }

@@ -1,0 +1,272 @@
+"""Real elevation maps: read a DEM, fill small holes, resample, cut into windows (SPEC section 11).
+
+Files are brought to one convention: row 0 is the southernmost, column 0 the westernmost, a value stands at its pixel's
+centre. GeoTIFF and whatever else rasterio reads run from north to south and are flipped; .npy and .npz are as grid.py.
+"""
+
+import hashlib
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from travjax.config import InputError, require, require_number
+from travjax.grid import Grid
+
+FILL_DISTANCE = 0.125
+"""Metres: a hole is filled when each of its nodes is this near to known ground."""
+
+COARSEST = 0.125
+"""Metres: cells larger than this do not show a step or a rock."""
+
+LOWEST, HIGHEST = -12_000.0, 30_000.0
+"""Metres: heights outside are no heights; a missing-value marker that the file does not declare, say."""
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Heights of one file in this package's convention.
+
+    heights:   [rows, cols] float64 metres, NaN unknown
+    cell_size: metres between neighbouring values
+    origin:    x, y of heights[0, 0], the south-west value
+    crs:       coordinate system as the file names it, or None
+    """
+
+    heights: np.ndarray
+    cell_size: float
+    origin: tuple[float, float] = (0.0, 0.0)
+    crs: str | None = None
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Square maps cut out of a DEM, and where each comes from.
+
+    heights:       [n, rows, cols] float32 metres above `height_offset`, NaN unknown
+    origins:       [n, 2] float64 x, y of each window's south-west node
+    cell_size:     metres between values in the file; the windows are at the grid's spacing
+    crs:           coordinate system as the file names it, or None
+    height_offset: metres, subtracted from the file's heights in float64
+    filled:        share of all nodes that was interpolated in small holes
+    unknown:       share of all nodes that stays unknown
+    path, sha256:  the file and its checksum
+    """
+
+    heights: np.ndarray
+    origins: np.ndarray
+    cell_size: float
+    crs: str | None
+    height_offset: float
+    filled: float
+    unknown: float
+    path: str
+    sha256: str
+
+
+def load_dem(
+    path: str | Path,
+    stride: float = 8.0,
+    *,
+    grid: Grid = Grid(),
+    cell_size: float | None = None,
+    nodata: float | None = None,
+    fill_holes: bool = True,
+    allow_coarse: bool = False,
+) -> Windows:
+    """Cuts a DEM into windows of the grid's size, starting at its south-west corner; partial windows are dropped.
+
+    path:         GeoTIFF or another raster that rasterio reads, .npy, or .npz with `heights` ([rows, cols], or several
+                  maps [n, rows, cols] that are cut one by one) and `cell_size`
+    stride:       metres between the origins of neighbouring windows, rounded to whole cells
+    cell_size:    metres, for files that do not say
+    nodata:       a height that marks unknown ground, if the file does not declare it
+    fill_holes:   interpolate holes whose every node lies within 0.125 m of known ground
+    allow_coarse: take cells larger than 0.125 m
+    Raises InputError when the file is missing, is no elevation map, is in degrees, has no, a non-square or too large a
+    cell size, infinite or absurd heights or none at all, or is smaller than one window.
+    """
+    path = Path(path)
+    require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
+    if cell_size is not None:
+        require_number("cell_size", cell_size, 0, 1000, "metres, above 0 and at most 1000")
+    try:
+        rasters = [_checked(raster, nodata, allow_coarse) for raster in _read(path, cell_size)]
+        offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round())
+        parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    heights, origins, filled, unknown = zip(*parts, strict=True)
+    return Windows(
+        heights=np.concatenate(heights),
+        origins=np.concatenate(origins),
+        cell_size=rasters[0].cell_size,
+        crs=rasters[0].crs,
+        height_offset=offset,
+        filled=float(np.mean(filled)),
+        unknown=float(np.mean(unknown)),
+        path=str(path),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )
+
+
+def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_holes: bool):
+    """(heights, origins, share filled, share unknown) of one raster."""
+    raster, filled = _filled(raster) if fill_holes else (raster, 0.0)
+    raster = resample(raster, grid.spacing)
+    corners = _corners(raster, stride, grid)
+    cut = [raster.heights[row : row + grid.nodes, col : col + grid.nodes] - offset for row, col in corners]
+    origins = np.array(raster.origin) + grid.spacing * np.array(corners)[:, ::-1]
+    return np.stack(cut).astype(np.float32), origins, filled, np.isnan(raster.heights).mean()
+
+
+def _read(path: Path, cell_size: float | None) -> list[Raster]:
+    if not path.is_file():
+        raise InputError("no such file")
+    if path.suffix in (".npy", ".npz"):
+        return _read_numpy(path, cell_size)
+    return [_read_raster(path, cell_size)]
+
+
+def _read_numpy(path: Path, cell_size: float | None) -> list[Raster]:
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        entries: dict[str, Any] = {"heights": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except (OSError, ValueError, EOFError, KeyError) as error:
+        raise InputError(f"cannot be read as {path.suffix}: {str(error).splitlines()[0]}") from None
+    if "heights" not in entries:
+        raise InputError(f"no array `heights`; it holds: {', '.join(entries) or 'nothing'}")
+    heights = entries["heights"]
+    real = np.issubdtype(heights.dtype, np.number) and not np.iscomplexobj(heights)
+    if heights.ndim not in (2, 3) or not heights.size or not real:
+        raise InputError(
+            f"heights: {heights.dtype} {list(heights.shape)}: must be numbers [rows, cols] or [n, rows, cols]"
+        )
+    if cell_size is None:
+        if "cell_size" not in entries:
+            raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
+        cell_size = _number(entries["cell_size"], "cell_size")
+    require_number("cell_size", cell_size, 0, 1000, "metres, above 0 and at most 1000")
+    origin = np.asarray(entries.get("origin", (0.0, 0.0)), float).reshape(-1)
+    require(
+        origin.shape == (2,) and bool(np.isfinite(origin).all()),
+        "origin",
+        origin.tolist(),
+        "x, y of the south-west value",
+    )
+    crs = str(entries["crs"]) if "crs" in entries else None
+    maps = heights.astype(np.float64).reshape(-1, *heights.shape[-2:])
+    return [Raster(one, float(cell_size), (float(origin[0]), float(origin[1])), crs) for one in maps]
+
+
+def _number(value: np.ndarray, name: str) -> float:
+    require(value.size == 1 and np.issubdtype(value.dtype, np.number), name, value.tolist(), "one number of metres")
+    return float(value.reshape(()))
+
+
+def _read_raster(path: Path, cell_size: float | None) -> Raster:
+    try:
+        import rasterio
+    except ImportError:
+        raise InputError('reading it needs rasterio: pip install "travjax[geo]"; .npy and .npz need nothing') from None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
+            with rasterio.open(path) as file:
+                heights, transform, crs, bands = file.read(1, masked=True), file.transform, file.crs, file.count
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"not a raster that can be read: {str(error).splitlines()[0]}") from None
+    require(bands == 1, "bands", bands, "1: an elevation map, not a picture")
+    if np.iscomplexobj(heights):
+        raise InputError(f"heights: {heights.dtype}: must be numbers")
+    if crs is not None and crs.is_geographic:
+        raise InputError(f"crs = {crs.to_string()}: is in degrees; reproject it to metres (a UTM zone, say) first")
+    if transform.is_identity:
+        if cell_size is None:
+            raise InputError("cell_size is missing: the file is not georeferenced; give it (--cell-size METRES)")
+    elif transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+        raise InputError(f"transform = {tuple(transform)[:6]}: must run east and south without rotation")
+    elif abs(transform.a + transform.e) > 1e-4 * transform.a:
+        raise InputError(f"cell_size = {transform.a:g} x {-transform.e:g}: must be square")
+    else:
+        cell_size = transform.a
+    west, south = (0.0, 0.0) if transform.is_identity else rasterio.transform.xy(transform, len(heights) - 1, 0)
+    known = np.ma.filled(heights.astype(np.float64), np.nan)
+    return Raster(known[::-1], float(cell_size), (float(west), float(south)), crs.to_string() if crs else None)
+
+
+def _checked(raster: Raster, nodata: float | None, allow_coarse: bool) -> Raster:
+    heights = np.where(raster.heights == nodata, np.nan, raster.heights) if nodata is not None else raster.heights
+    known = heights[~np.isnan(heights)]
+    if not known.size:
+        raise InputError("heights: all unknown (NaN or nodata): must hold some known ground")
+    for bad in (known.min(), known.max()):
+        if not LOWEST <= bad <= HIGHEST or bad in (-9999, -99999, -32768, 9999):
+            raise InputError(
+                f"heights = {bad:g}: must lie between {LOWEST:g} and {HIGHEST:g} m; "
+                "if it marks unknown ground, say so (--nodata VALUE)"
+            )
+    if raster.cell_size > COARSEST + 1e-9 and not allow_coarse:
+        raise InputError(
+            f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it anyway)"
+        )
+    return Raster(heights, raster.cell_size, raster.origin, raster.crs)
+
+
+def _filled(raster: Raster) -> tuple[Raster, float]:
+    """Interpolates the small holes linearly between the known nodes around them; also the share of nodes filled."""
+    from scipy import interpolate, ndimage  # takes 0.3 s to import
+
+    unknown = np.isnan(raster.heights)
+    everywhere = np.ones((3, 3), bool)
+    far = ndimage.distance_transform_edt(unknown, sampling=raster.cell_size) > FILL_DISTANCE + 1e-9
+    hole, holes = ndimage.label(unknown, everywhere)
+    deep = np.zeros(holes + 1, bool)
+    deep[hole[far]] = True
+    small = unknown & ~deep[hole]
+    if not small.any():
+        return raster, 0.0
+    around = ndimage.binary_dilation(small, everywhere) & ~unknown
+    heights = raster.heights.copy()
+    points, values = np.argwhere(around), heights[around]
+    heights[small] = interpolate.NearestNDInterpolator(points, values)(np.argwhere(small))
+    if len(points) >= 4 and np.ptp(points, axis=0).all():
+        linear = interpolate.LinearNDInterpolator(points, values)(np.argwhere(small))
+        heights[small] = np.where(np.isnan(linear), heights[small], linear)
+    return Raster(heights, raster.cell_size, raster.origin, raster.crs), float(small.mean())
+
+
+def resample(raster: Raster, spacing: float) -> Raster:
+    """Bilinear values at another spacing, from the same south-west node; smoothed first where the source is finer.
+
+    A node is unknown where a value that it is made from is.
+    """
+    from scipy import ndimage  # takes 0.3 s to import
+
+    ratio = spacing / raster.cell_size
+    if abs(ratio - 1) < 1e-6:
+        return raster
+    unknown = np.isnan(raster.heights)
+    level = np.nanmedian(raster.heights)
+    heights, share = np.where(unknown, 0.0, raster.heights - level), (~unknown).astype(float)
+    if ratio > 1:
+        sigma = (ratio - 1) / 2
+        heights, share = (ndimage.gaussian_filter(field, sigma, mode="nearest") for field in (heights, share))
+        heights = np.divide(heights, share, out=heights, where=share > 0)
+    rows, cols = (np.arange(int((edge - 1) / ratio + 1e-6) + 1) * ratio for edge in raster.heights.shape)
+    at = np.meshgrid(rows, cols, indexing="ij")
+    values = ndimage.map_coordinates(heights, at, order=1, mode="nearest")
+    missing = ndimage.map_coordinates(unknown.astype(float), at, order=1, mode="nearest") > 1e-6
+    return Raster(np.where(missing, np.nan, values + level), raster.cell_size, raster.origin, raster.crs)
+
+
+def _corners(raster: Raster, stride: float, grid: Grid) -> list[tuple[int, int]]:
+    """Rows and columns of the south-west nodes of all full windows."""
+    rows, cols = raster.heights.shape
+    if min(rows, cols) < grid.nodes:
+        north, east = (rows - 1) * grid.spacing, (cols - 1) * grid.spacing
+        raise InputError(f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m")
+    step = max(1, round(stride / grid.spacing))
+    return [(row, col) for row in range(0, rows - grid.cells, step) for col in range(0, cols - grid.cells, step)]
