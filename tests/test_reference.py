@@ -85,9 +85,7 @@ def test_quarter_circle(radius, side):
     second = [side * TIGHTEST * (1.0 - math.cos(turned)), TIGHTEST * math.sin(turned), -side * turned]
     np.testing.assert_allclose(path[1], second, atol=1e-12)
     np.testing.assert_allclose(path[28], [side * TIGHTEST, TIGHTEST, -side * math.pi / 2.0], atol=1e-12)
-    np.testing.assert_allclose(
-        path[-1], [side * (TIGHTEST + LENGTH), TIGHTEST, -side * math.pi / 2.0], atol=1e-12
-    )
+    np.testing.assert_allclose(path[-1], [side * (TIGHTEST + LENGTH), TIGHTEST, -side * math.pi / 2.0], atol=1e-12)
 
 
 def test_s_curve_of_two_quarter_circles():

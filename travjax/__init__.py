@@ -10,30 +10,10 @@ margins and failures.
 
 from importlib.metadata import version
 
-from travjax.actions import ActionSpace
-from travjax.config import InputError
-from travjax.dem import load_dem
-from travjax.grid import Grid
-from travjax.robot import Robot
-from travjax.terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
-from travjax.traverse import EVENTS, Margins, failures, label, simulate
+import lazy_loader
 
 __version__ = version("travjax")
 
-__all__ = [
-    "EVENTS",
-    "STYLES",
-    "ActionSpace",
-    "Grid",
-    "InputError",
-    "Margins",
-    "Robot",
-    "TerrainParams",
-    "elevation",
-    "failures",
-    "generate_terrain",
-    "label",
-    "load_dem",
-    "sample_params",
-    "simulate",
-]
+# Names are imported when they are first used, since __main__.py has to set up logging before JAX is imported. A public
+# name must not be the name of a module as well: importing the module would hide it.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

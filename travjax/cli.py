@@ -128,8 +128,6 @@ def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
 
 def _use_compilation_cache() -> None:
     """Compiled code is kept between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
-    # When it reads compiled code back, XLA logs an error on two "machine features" that are tuning hints of its own.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "travjax" / "jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))
@@ -315,18 +313,20 @@ def _config(robot: Robot, actions: ActionSpace, grid: Grid) -> str:
 
 
 def _samples(maps: dict[str, np.ndarray], most: int = 5) -> np.ndarray:
-    """Maps to show, the groups in turn: those that fail neither nowhere nor everywhere first."""
+    """Maps to show, evenly from each group, where there are any from those that fail in part."""
     fails = (maps["failed"].any(axis=-1) & maps["known"]).mean(axis=-1)
-    dull = (fails < 0.05) | (fails > 0.6)
-    order = np.lexsort((np.arange(len(fails)), dull))
-    groups: dict[str, list[int]] = {}
-    for index in order:
-        groups.setdefault(maps["group"][index], []).append(index)
-    turns = sorted((rank, index) for members in groups.values() for rank, index in enumerate(members))
-    return np.array([index for _, index in turns[:most]])
+    telling = (fails > 0.05) & (fails < 0.6)
+    groups = list(dict.fromkeys(maps["group"]))[:most]
+    chosen = []
+    for rank, group in enumerate(groups):
+        members = np.flatnonzero(maps["group"] == group)
+        members = members[telling[members]] if telling[members].any() else members
+        count = min(len(members), len(range(rank, most, len(groups))))
+        chosen += list(members[np.linspace(0, len(members) - 1, count + 2).round().astype(int)[1:-1]])
+    return np.array(chosen)
 
 
 def _where(maps: dict[str, np.ndarray], index: int) -> str:
     if "seed" in maps:
         return f"seed {maps['seed'][index]}"
-    return "at ({:.1f}, {:.1f})".format(*maps["origin"][index])
+    return "from ({:.1f}, {:.1f})".format(*maps["origin"][index])

@@ -6,6 +6,7 @@ ends in `_deg` holds degrees; everything else is named as the field is.
 
 import dataclasses
 import math
+import textwrap
 import tomllib
 from numbers import Real
 from pathlib import Path
@@ -21,7 +22,8 @@ class InputError(ValueError):
 def require(condition: bool, field: str, value: object, allowed: str) -> None:
     """Raises InputError "field = value: must be allowed" unless the condition holds."""
     if not condition:
-        raise InputError(f"{field} = {value!r}: must be {allowed}")
+        shown = textwrap.shorten(repr(value), 80, placeholder=" ...")
+        raise InputError(f"{field} = {shown}: must be {allowed}")
 
 
 def require_number(field: str, value: object, low: float, high: float, allowed: str) -> None:

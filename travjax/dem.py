@@ -6,9 +6,10 @@ centre. GeoTIFF and whatever else rasterio reads run from north to south and are
 
 import hashlib
 import warnings
+import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -133,14 +134,18 @@ def _read(path: Path, cell_size: float | None) -> list[Raster]:
 def _read_numpy(path: Path, cell_size: float | None) -> list[Raster]:
     try:
         loaded = np.load(path, allow_pickle=False)
-        entries: dict[str, Any] = {"heights": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-    except (OSError, ValueError, EOFError, KeyError) as error:
-        raise InputError(f"cannot be read as {path.suffix}: {str(error).splitlines()[0]}") from None
+        if isinstance(loaded, np.ndarray):
+            entries = {"heights": loaded}
+        else:
+            with loaded:
+                entries = dict(loaded)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        reason = str(error).splitlines() or ["it is cut short"]
+        raise InputError(f"cannot be read as {path.suffix}: {reason[0]}") from None
     if "heights" not in entries:
         raise InputError(f"no array `heights`; it holds: {', '.join(entries) or 'nothing'}")
     heights = entries["heights"]
-    real = np.issubdtype(heights.dtype, np.number) and not np.iscomplexobj(heights)
-    if heights.ndim not in (2, 3) or not heights.size or not real:
+    if heights.ndim not in (2, 3) or not heights.size or not _is_real(heights):
         raise InputError(
             f"heights: {heights.dtype} {list(heights.shape)}: must be numbers [rows, cols] or [n, rows, cols]"
         )
@@ -149,20 +154,20 @@ def _read_numpy(path: Path, cell_size: float | None) -> list[Raster]:
             raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
         cell_size = _number(entries["cell_size"], "cell_size")
     require_number("cell_size", cell_size, 0, 1000, "metres, above 0 and at most 1000")
-    origin = np.asarray(entries.get("origin", (0.0, 0.0)), float).reshape(-1)
-    require(
-        origin.shape == (2,) and bool(np.isfinite(origin).all()),
-        "origin",
-        origin.tolist(),
-        "x, y of the south-west value",
-    )
+    origin = np.asarray(entries.get("origin", (0.0, 0.0))).reshape(-1)
+    pair = origin.shape == (2,) and _is_real(origin) and bool(np.isfinite(origin).all())
+    require(pair, "origin", origin.tolist(), "x, y of the south-west value")
     crs = str(entries["crs"]) if "crs" in entries else None
     maps = heights.astype(np.float64).reshape(-1, *heights.shape[-2:])
     return [Raster(one, float(cell_size), (float(origin[0]), float(origin[1])), crs) for one in maps]
 
 
+def _is_real(array: np.ndarray) -> bool:
+    return np.issubdtype(array.dtype, np.integer) or np.issubdtype(array.dtype, np.floating)
+
+
 def _number(value: np.ndarray, name: str) -> float:
-    require(value.size == 1 and np.issubdtype(value.dtype, np.number), name, value.tolist(), "one number of metres")
+    require(value.size == 1 and _is_real(value), name, value.tolist(), "one number of metres")
     return float(value.reshape(()))
 
 
@@ -216,26 +221,49 @@ def _checked(raster: Raster, nodata: float | None, allow_coarse: bool) -> Raster
 
 
 def _filled(raster: Raster) -> tuple[Raster, float]:
-    """Interpolates the small holes linearly between the known nodes around them; also the share of nodes filled."""
-    from scipy import interpolate, ndimage  # takes 0.3 s to import
+    """Fills the small holes; also the share of nodes filled."""
+    from scipy import ndimage  # takes 0.3 s to import
 
     unknown = np.isnan(raster.heights)
-    everywhere = np.ones((3, 3), bool)
     far = ndimage.distance_transform_edt(unknown, sampling=raster.cell_size) > FILL_DISTANCE + 1e-9
-    hole, holes = ndimage.label(unknown, everywhere)
+    hole, holes = ndimage.label(unknown, np.ones((3, 3)))
     deep = np.zeros(holes + 1, bool)
     deep[hole[far]] = True
     small = unknown & ~deep[hole]
     if not small.any():
         return raster, 0.0
-    around = ndimage.binary_dilation(small, everywhere) & ~unknown
-    heights = raster.heights.copy()
-    points, values = np.argwhere(around), heights[around]
-    heights[small] = interpolate.NearestNDInterpolator(points, values)(np.argwhere(small))
-    if len(points) >= 4 and np.ptp(points, axis=0).all():
-        linear = interpolate.LinearNDInterpolator(points, values)(np.argwhere(small))
-        heights[small] = np.where(np.isnan(linear), heights[small], linear)
+    heights = _interpolated(raster.heights, small)
     return Raster(heights, raster.cell_size, raster.origin, raster.crs), float(small.mean())
+
+
+def _interpolated(heights: np.ndarray, holes: np.ndarray) -> np.ndarray:
+    """Heights where each node of a hole is the mean of its four neighbours: a plane stays one, no new extremes arise.
+
+    What lies outside the raster does not count. Nodes beside a hole are known or of the same hole.
+    """
+    from scipy.sparse import csc_matrix, diags
+    from scipy.sparse.linalg import spsolve
+
+    row, col = np.nonzero(holes)
+    number = np.full(holes.shape, -1)
+    number[holes] = np.arange(len(row))
+    level = heights[~np.isnan(heights)].mean()
+    neighbours, known = np.zeros(len(row)), np.zeros(len(row))
+    links = []
+    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        r, c = row + down, col + right
+        inside = (r >= 0) & (r < holes.shape[0]) & (c >= 0) & (c < holes.shape[1])
+        beside = np.flatnonzero(inside)
+        neighbours += inside
+        other = number[r[beside], c[beside]]
+        ground = other < 0
+        known[beside[ground]] += heights[r[beside[ground]], c[beside[ground]]] - level
+        links.append(np.stack([beside[~ground], other[~ground]]))
+    here, there = np.concatenate(links, axis=1)
+    coupling = csc_matrix((np.ones(len(here)), (here, there)), (len(row), len(row)))
+    filled = heights.copy()
+    filled[holes] = spsolve(diags(neighbours, format="csc") - coupling, known) + level
+    return filled
 
 
 def resample(raster: Raster, spacing: float) -> Raster:

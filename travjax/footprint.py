@@ -233,7 +233,7 @@ def chassis_places(chassis: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarra
     fits &= run > 1 and fits.any(axis=1).all()
     runs, singles = _places(row, start, np.where(fits, count, 0), run), _places(row, start, np.where(fits, 0, count), 1)
     anywhere = np.take_along_axis(flat[:, :2], np.argmax(count > 0, axis=1)[:, None, None], axis=2)
-    narrow = np.where(fits, 0, count).any(axis=1, keepdims=True)
+    narrow: np.ndarray = np.any(np.where(fits, 0, count), axis=1, keepdims=True)
     singles = np.where(narrow[..., None], singles, anywhere.astype(singles.dtype))
     return runs.reshape(*chassis.shape[:2], 2, -1), singles.reshape(*chassis.shape[:2], 2, -1)
 

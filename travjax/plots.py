@@ -148,13 +148,13 @@ def robot_figure(robot: Robot) -> Figure:
     side.plot(
         [-1.6 * edge, edge, edge, 1.6 * edge], [0, 0, robot.max_step, robot.max_step], color="saddlebrown", linewidth=2
     )
-    _dimension(side, (-edge, 0), (-edge, robot.ride_height), "ride height", (-6, 0))
-    _dimension(side, (1.15 * edge, 0), (1.15 * edge, robot.max_step), "largest step", (6, 0))
+    _dimension(side, (-edge, 0), (-edge, robot.ride_height), "ride height", (0, 5))
+    _dimension(side, (1.15 * edge, 0), (1.15 * edge, robot.max_step), "largest step", (0, 5))
     _dimension(side, (-radius - axle, -0.5 * radius), (radius - axle, -0.5 * radius), "wheel diameter", (0, -5))
     side.set(title=f"side; largest tilt {np.degrees(robot.max_tilt):.1f} deg", xlabel="forward [m]", ylabel="up [m]")
     reach = 0.75 * robot.overall_length
     plan.set(xlim=(-reach, reach), ylim=(-reach, reach))
-    side.set(xlim=(-2.1 * edge, 2.1 * edge), ylim=(-1.6 * radius, 2 * edge))
+    side.set(xlim=(-2.1 * edge, 2.1 * edge), ylim=(-1.6 * radius, 1.2 * edge))
     for ax in (plan, side):
         ax.set_aspect("equal")
         ax.grid(alpha=0.3)
@@ -163,14 +163,15 @@ def robot_figure(robot: Robot) -> Figure:
 
 
 def _dimension(ax, start: tuple[float, float], end: tuple[float, float], name: str, offset: tuple[int, int]) -> None:
-    """An arrow with the length that it spans beside it, `offset` points away."""
+    """An arrow with the length that it spans beside it, `offset` points away from its middle, or from its top end."""
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     ax.annotate("", end, start, arrowprops=dict(arrowstyle="<->", shrinkA=0, shrinkB=0, color="tab:blue"))
     across = {1: "left", 0: "center", -1: "right"}[int(np.sign(offset[0]))]
     along = {1: "bottom", 0: "center", -1: "top"}[int(np.sign(offset[1]))]
     text = f"{name} {length:.3f} m" if offset[1] else f"{name}\n{length:.3f} m"
     place = dict(textcoords="offset points", ha=across, va=along, fontsize=9, color="tab:blue")
-    ax.annotate(text, ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2), offset, **place)
+    middle = ((start[0] + end[0]) / 2, max(start[1], end[1]) if offset[1] else (start[1] + end[1]) / 2)
+    ax.annotate(text, middle, offset, **place)
 
 
 def action_figure(actions: ActionSpace, robot: Robot, grid: Grid) -> Figure:

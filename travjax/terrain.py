@@ -216,7 +216,8 @@ def _elevation_of_one(params: TerrainParams, permutation, grid: Grid) -> Float[A
     mix = (noise(*(largest - (largest - smallest) * d for d in (params.distribution_x, params.distribution_y))) + 1) / 2
     start = params.perc_obstacles - 0.2 * params.smooth_transition
     end = params.perc_obstacles + 0.2 * params.smooth_transition
-    weight = jnp.where(mix < start, 0.0, jnp.where(mix > end, 1.0, (mix - start) / (end - start)))
+    between = (mix - start) / jnp.where(end > start, end - start, 1.0)
+    weight = jnp.where(mix < start, 0.0, jnp.where(mix > end, 1.0, between))
 
     feature = (largest - smallest) * params.smooth_plains + smallest
     base = jnp.maximum(noise(feature, feature) + 1, 0) * params.max_slope_variation * 0.15 * grid.size

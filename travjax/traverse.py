@@ -30,7 +30,7 @@ FEW_MAPS = 2
 """Up to this many maps, RUN neighbouring nodes are read at once: the lanes alone would not fill a vector register."""
 
 CHUNK = 200_000
-"""Poses times lanes simulated at once: a float32 array of that many fits in the second-level cache of a core."""
+"""Poses times lanes that a CPU simulates at once: a float32 array of them fits in the second-level cache of a core."""
 
 PLACES = 8
 """Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
@@ -116,6 +116,7 @@ def label(
     return failures(simulate(heights, robot, actions, grid=grid), robot)
 
 
+@jax.jit
 def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
     """Labels in one byte a trajectory: bits 0 to 2 the failures in the order of EVENTS, bit 3 unknown."""
     bits = jnp.concatenate([failed, ~known[..., None]], axis=-1)
@@ -152,7 +153,7 @@ def as_maps(heights, grid: Grid) -> Float[Array, "n rows cols"]:
         )
     if isinstance(maps, np.ndarray) and maps.dtype != np.float32:
         maps = maps.astype(np.float64)
-        maps = maps - maps[:, grid.cells // 2, grid.cells // 2, None, None]
+        maps = maps - np.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
     return jnp.asarray(maps, jnp.float32)
 
 
@@ -182,8 +183,9 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
     """The chunks for batches of `maps` and the `source` of a NodeTable, on the device."""
     table = node_table(robot, actions, grid)
     runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
-    poses = maps * len(table.layout.views) * table.layout.poses
-    arcs = min(len(table.centre), max(1, round(CHUNK / poses)))
+    arcs = len(table.centre)
+    if jax.default_backend() == "cpu":
+        arcs = min(arcs, max(1, round(CHUNK / (maps * len(table.layout.views) * table.layout.poses))))
     padding = -len(table.centre) % arcs
 
     def cut(array):
@@ -214,7 +216,7 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
 @partial(jax.jit, static_argnames="layout")
 def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -> Margins:
     grid = layout.grid
-    heights = maps - maps[:, grid.cells // 2, grid.cells // 2, None, None]
+    heights = maps - jnp.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
     heights = jnp.where(jnp.isnan(heights), UNKNOWN, heights)
     # Without these barriers XLA computes both anew for every element that is gathered from them.
     by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)

@@ -1,0 +1,128 @@
+"""What the tests share: varied maps, settings of robot, actions and grid, and the `gpu` marker.
+
+Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
+"""
+
+import math
+import os
+from dataclasses import replace
+from typing import NamedTuple
+
+import hypothesis
+import jax
+import numpy as np
+import pytest
+
+from travjax.actions import ActionSpace
+from travjax.grid import Grid
+from travjax.robot import Robot
+from travjax.terrain import STYLES, generate_terrain
+
+if "JAX_PLATFORMS" not in os.environ:
+    jax.config.update("jax_platforms", "cpu")
+
+hypothesis.settings.register_profile("travjax", deadline=None, max_examples=25, derandomize=True)
+hypothesis.settings.load_profile("travjax")
+
+
+def pytest_collection_modifyitems(items):
+    if jax.default_backend() != "gpu":
+        skip = pytest.mark.skip(reason=f"needs a GPU, and JAX runs on {jax.default_backend()} here")
+        for item in items:
+            if "gpu" in item.keywords:
+                item.add_marker(skip)
+
+
+@pytest.fixture(scope="session")
+def maps() -> dict[str, np.ndarray]:
+    """Seven maps, [129, 129] float32 metres: one of every style, a steep rough one, and a bumpy one with holes.
+
+    The seeds are chosen so that on every map some trajectories fail and some do not.
+    """
+    synthetic = np.asarray(generate_terrain(STYLES, [4, 7, 9, 4, 20]))
+    y, x = np.meshgrid(Grid().axis(), Grid().axis(), indexing="ij")
+    noise = np.random.default_rng(0).standard_normal((2, *Grid().shape))
+    steep = 0.64 * x - 0.2 * y + 0.012 * noise[0]
+    holes = 0.1 * np.sin(2 * x) * np.cos(3 * y) + 0.01 * noise[1]
+    holes[np.hypot(x - 1.5, y - 1.5) < 0.4] = np.nan
+    holes[[110, 20, 70], [60, 61, 10]] = np.nan
+    named = dict(zip(STYLES, synthetic, strict=True)) | {"steep": steep, "holes": holes}
+    return {name: heights.astype(np.float32) for name, heights in named.items()}
+
+
+MAP_NAMES = (*STYLES, "steep", "holes")
+
+
+@pytest.fixture(scope="session", params=MAP_NAMES)
+def map_name(request) -> str:
+    """The name of each of the maps in turn."""
+    return request.param
+
+
+class Setting(NamedTuple):
+    """Everything a node table depends on."""
+
+    robot: Robot
+    actions: ActionSpace
+    grid: Grid = Grid()
+
+
+SEEKUR_JR, HUSKY, LEO_ROVER = map(Robot.load, ("seekur_jr", "husky_a200", "leo_rover"))
+STRAIGHT = (math.inf,)
+CELL = Grid().spacing
+
+TIES = replace(SEEKUR_JR, track=9 * CELL, wheelbase=7 * CELL, chassis_width=6 * CELL, chassis_length=16 * CELL)
+"""Where its centre is on a node and it faces along an axis, wheels are midway between nodes, chassis edges on nodes."""
+
+SETTINGS = {
+    "paper": Setting(SEEKUR_JR, ActionSpace()),
+    "odd number of turns": Setting(HUSKY, ActionSpace(turns=5, interval=0.11)),
+    "unpaired radii": Setting(LEO_ROVER, ActionSpace(turns=6, radii=(math.inf, 1.5, -0.9), interval=0.1)),
+    "odd turns and unpaired radii": Setting(SEEKUR_JR, ActionSpace(turns=3, radii=(1.5, math.inf, 4.0), interval=0.08)),
+    "arcs of different length": Setting(
+        HUSKY, ActionSpace(turns=2, arc_lengths=(1.0, 2.2), radii=(-1.2, math.inf, 1.2), interval=0.15)
+    ),
+    "ties and quarter circles": Setting(
+        TIES,
+        ActionSpace(
+            turns=4,
+            radii=(math.inf, 16 * CELL, -16 * CELL),
+            arc_lengths=(8 * math.pi * CELL, 24 * CELL),
+            interval=2 * CELL,
+        ),
+    ),
+    "ties on and between nodes": Setting(
+        TIES, ActionSpace(turns=4, radii=STRAIGHT, arc_lengths=(8 * CELL, 12 * CELL), interval=CELL / 2)
+    ),
+    "coarse small map": Setting(
+        HUSKY,
+        ActionSpace(turns=4, arc_lengths=(0.6, 0.5), radii=(math.inf, 0.7, -0.7), interval=0.1),
+        Grid(4, 0.125),
+    ),
+    "fine large map": Setting(
+        SEEKUR_JR, ActionSpace(turns=8, radii=(math.inf, 2.0, -2.0), interval=0.1), Grid(10, 0.05)
+    ),
+    "chassis without four nodes in a row": Setting(
+        replace(SEEKUR_JR, chassis_width=0.1, chassis_length=0.1),
+        ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5), interval=0.1),
+    ),
+    "chassis with four nodes in some rows": Setting(
+        replace(SEEKUR_JR, chassis_width=0.2, chassis_length=0.3),
+        ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5), interval=0.1),
+    ),
+    "chassis with four nodes in all rows": Setting(
+        SEEKUR_JR, ActionSpace(turns=1, radii=STRAIGHT, arc_lengths=(0.5, 0.5), interval=0.5)
+    ),
+    "chassis longer than 127 nodes": Setting(
+        replace(SEEKUR_JR, chassis_length=2.1),
+        ActionSpace(turns=2, radii=STRAIGHT, arc_lengths=(0.2, 0.2), interval=0.2),
+        Grid(4, 1 / 128),
+    ),
+}
+"""Settings that take different ways through the tables and the kernel."""
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def setting(request) -> Setting:
+    """Each of the settings in turn."""
+    return SETTINGS[request.param]

@@ -1,0 +1,128 @@
+"""Configurations from TOML files, and the one line that says what is wrong with one."""
+
+import math
+from dataclasses import dataclass
+
+import pytest
+
+from travjax.config import InputError, load_toml, require, require_number
+
+
+@dataclass(frozen=True)
+class Ramp:
+    length: float
+    slope: float
+    marks: tuple[float, ...] = (0.0,)
+
+    def __post_init__(self):
+        require_number("length", self.length, 0, 100, "a length in metres, above 0 and at most 100")
+        require(self.slope < 1, "slope", self.slope, "below 1 rad")
+
+
+@pytest.fixture
+def ramp_file(tmp_path):
+    """Writes a text to ramp.toml and returns its path."""
+
+    def write(text):
+        path = tmp_path / "ramp.toml"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return write
+
+
+def refusal(path) -> str:
+    """What load_toml says about a wrong file: one line that starts with the file's name."""
+    with pytest.raises(InputError) as raised:
+        load_toml(path, Ramp)
+    message = str(raised.value)
+    assert message.startswith(f"{path}: ")
+    assert "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+def test_a_file_gives_fields_by_name_and_defaults_for_the_rest(ramp_file):
+    assert load_toml(ramp_file("length = 2.5\nslope = 0.5"), Ramp) == Ramp(2.5, 0.5, (0.0,))
+
+
+def test_a_path_may_be_text(ramp_file):
+    assert load_toml(str(ramp_file("length = 2.5\nslope = 0.5")), Ramp).length == 2.5
+
+
+def test_degrees_become_radians(ramp_file):
+    assert load_toml(ramp_file("length = 1\nslope_deg = 30"), Ramp).slope == pytest.approx(math.pi / 6, abs=1e-15)
+
+
+def test_a_list_becomes_a_tuple(ramp_file):
+    ramp = load_toml(ramp_file("length = 1\nslope = 0\nmarks = [1, inf]"), Ramp)
+    assert ramp.marks == (1, math.inf)
+    assert hash(ramp) == hash(Ramp(1, 0, (1, math.inf)))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    assert refusal(tmp_path / "none.toml") == "cannot be read: No such file or directory"
+
+
+def test_a_folder_is_no_file(tmp_path):
+    assert refusal(tmp_path) == "cannot be read: Is a directory"
+
+
+@pytest.mark.parametrize("text", ["length = ", "length 1", "= 3", "length = 1\nlength = 2", "[ramp"])
+def test_text_that_is_not_toml_is_said_to_be_none(ramp_file, text):
+    assert refusal(ramp_file(text)).startswith("not a TOML file: ")
+
+
+def test_bytes_that_are_not_text_cannot_be_read(ramp_file):
+    assert refusal(ramp_file(b"length = \xff\xfe")).startswith("cannot be read: ")
+
+
+def test_an_unknown_key_is_named_with_the_allowed_ones(ramp_file):
+    assert refusal(ramp_file("length = 1\nslop = 0")) == "unknown key 'slop'; allowed: length, slope, marks"
+
+
+def test_an_unknown_key_in_degrees_is_named_as_written(ramp_file):
+    assert refusal(ramp_file("length = 1\nslop_deg = 0")).startswith("unknown key 'slop_deg'; allowed: ")
+
+
+def test_a_table_is_no_field(ramp_file):
+    assert refusal(ramp_file("[ramp]\nlength = 1")).startswith("unknown key 'ramp'; allowed: ")
+
+
+def test_missing_keys_are_all_named_and_defaults_are_not(ramp_file):
+    assert refusal(ramp_file("marks = [1]")) == "missing length, slope"
+
+
+def test_an_empty_file_misses_what_has_no_default(ramp_file):
+    assert refusal(ramp_file("")) == "missing length, slope"
+
+
+def test_a_refused_value_is_named_with_file_field_and_what_is_allowed(ramp_file):
+    message = refusal(ramp_file("length = -2\nslope = 0"))
+    assert message == "length = -2: must be a length in metres, above 0 and at most 100"
+
+
+@pytest.mark.parametrize("value", ["'30'", "true", "nan", "inf", "[30]"])
+def test_degrees_must_be_a_number(ramp_file, value):
+    message = refusal(ramp_file(f"length = 1\nslope_deg = {value}"))
+    assert message.startswith("slope_deg = ")
+    assert message.endswith(": must be a number of degrees")
+
+
+def test_bad_input_is_a_value_error():
+    with pytest.raises(ValueError, match="^field = 'x': must be y$"):
+        require(False, "field", "x", "y")
+
+
+def test_what_holds_is_not_refused():
+    require(True, "field", "x", "y")
+
+
+@pytest.mark.parametrize("value", [0.1, 1, 2, 2.0])
+def test_a_number_within_the_bounds_is_allowed(value):
+    require_number("field", value, 0, 2, "above 0, at most 2")
+
+
+@pytest.mark.parametrize("value", [0, 2.0001, -1, math.nan, math.inf, -math.inf, "1", None, True, [1], 1j])
+def test_what_is_no_finite_number_within_the_bounds_is_refused(value):
+    with pytest.raises(InputError, match="^field = .*: must be above 0, at most 2$"):
+        require_number("field", value, 0, 2, "above 0, at most 2")
