@@ -20,6 +20,7 @@ from travjax.batching import BATCH
 from travjax.config import InputError, require
 from travjax.dem import load_dem
 from travjax.files import output_folder, save_npz, written_whole
+from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import FIELDS, STYLES, elevation, sample_params
@@ -170,6 +171,7 @@ def _label(arguments: argparse.Namespace) -> None:
         styles, total, seed = arguments.style or list(STYLES), _count(arguments), _seed(arguments)
         names = [styles[number % len(styles)] for number in range(total)]
         source = _synthetic(names, list(range(seed, seed + total)), grid)
+    node_table(robot, actions, grid)  # refuses what does not fit together before anything is made
     out = output_folder(arguments.out)
 
     labelled = []

@@ -100,7 +100,7 @@ def cell_codes(permutation: Int[Array, "256"], i: Int[Array, "*s"], j: Int[Array
 
 def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
     """Noise at points, given a function from cell indices (i, j) to the cells' codes."""
-    skew = (x + y) * SKEW
+    skew = _rounded((x + y) * SKEW)
     i, j = jnp.floor(x + skew), jnp.floor(y + skew)
     inside_x, inside_y = x + skew - i, y + skew - j
     code = code_of_cell(i.astype(jnp.int32), j.astype(jnp.int32))
@@ -111,6 +111,16 @@ def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
     up = jnp.where(wide, jnp.where(below, -1.0, 0.0), jnp.where(below, 1.0, 2.0))
     corners = [(a, b, 3 * bits) for bits, (a, b) in enumerate(AROUND[:4])]
     return sum(_contribution(code >> shift, dx, dy, a, b) for a, b, shift in (*corners, (right, up, outside))) / NORM
+
+
+def _rounded(product):
+    """A product that is rounded before it is added to something.
+
+    XLA repeats cheap expressions in several loops, and contracts product and sum to one operation in some of them only.
+    Beside the edge of a cell the point would be taken to lie in one cell here and in the next one there.
+    The bound is never reached, which no optimiser knows.
+    """
+    return jnp.maximum(product, -1e30)
 
 
 def _contribution(gradient, dx, dy, right, up):
