@@ -64,6 +64,13 @@ def test_an_end_on_a_multiple_of_the_interval_is_one_station():
     np.testing.assert_allclose(actions.second_stations(), [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("count", range(1, 40))
+def test_rounding_adds_no_station_before_the_end_of_an_arc(count):
+    """0.54 / 0.06 is 9.000000000000002 in floating point, for one."""
+    actions = ActionSpace(arc_lengths=(round(0.06 * count, 2), 2.0))
+    assert len(actions.first_stations()) == count + 1
+
+
 def test_the_second_arc_counts_fastest():
     actions = ActionSpace()
     assert [actions.index(*arcs) for arcs in [(0, 0, 0), (0, 0, 1), (0, 1, 0), (1, 0, 0)]] == [0, 1, 13, 169]

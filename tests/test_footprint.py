@@ -161,6 +161,14 @@ def test_rows_shorter_than_a_run_are_covered_node_by_node():
     np.testing.assert_array_equal(singles[0, 0], [[-1, -1, -1], [5, 6, 7]])
 
 
+def test_places_that_a_pose_does_not_need_repeat_nodes_of_its_own():
+    """The first pose needs three single nodes and one run, the second no single one and two runs."""
+    runs, singles = chassis_places(np.concatenate([one_pose((-2, 5, 3), (1, 2, 4)), one_pose((3, 1, 4), (4, 1, 4))]), 4)
+    assert runs.shape == (2, 1, 2, 2) and singles.shape == (2, 1, 2, 3)
+    np.testing.assert_array_equal(runs[0, 0], [[1, 1], [2, 2]])
+    assert covered_by(singles[1, 0]) <= covered_by(runs[1, 0], 4)
+
+
 def test_all_nodes_are_single_where_a_pose_has_no_row_as_long_as_a_run():
     chassis = np.concatenate([one_pose((0, 0, 4)), one_pose((0, 0, 3))])
     runs, singles = chassis_places(chassis, 4)

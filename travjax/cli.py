@@ -182,11 +182,11 @@ def _label(arguments: argparse.Namespace) -> None:
     maps = _joined(labelled)
 
     table = report.shares_table(maps["group"], maps["failed"], maps["known"])
-    print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+    labels = save_npz(out / "labels.npz", config=_config(robot, actions, grid), cell_size=grid.spacing, **maps)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(table + "\n")
-    print(out / "shares.txt")
-    print(save_npz(out / "labels.npz", config=_config(robot, actions, grid), cell_size=grid.spacing, **maps))
+    print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+    print(labels, out / "shares.txt", sep="\n")
     if arguments.no_figures:
         return
     from travjax import plots  # matplotlib takes 0.3 s to import
@@ -315,17 +315,15 @@ def _config(robot: Robot, actions: ActionSpace, grid: Grid) -> str:
 
 
 def _samples(maps: dict[str, np.ndarray], most: int = 5) -> np.ndarray:
-    """Maps to show, evenly from each group, where there are any from those that fail in part."""
+    """Maps to show, the groups in turn and spread over each, those first that fail neither nowhere nor everywhere."""
     fails = (maps["failed"].any(axis=-1) & maps["known"]).mean(axis=-1)
-    telling = (fails > 0.05) & (fails < 0.6)
-    groups = list(dict.fromkeys(maps["group"]))[:most]
-    chosen = []
-    for rank, group in enumerate(groups):
-        members = np.flatnonzero(maps["group"] == group)
-        members = members[telling[members]] if telling[members].any() else members
-        count = min(len(members), len(range(rank, most, len(groups))))
-        chosen += list(members[np.linspace(0, len(members) - 1, count + 2).round().astype(int)[1:-1]])
-    return np.array(chosen)
+    dull = (fails < 0.05) | (fails > 0.6)
+    spread = np.arange(len(fails)) * 0.618034 % 1  # the smallest few of these lie far apart
+    groups: dict[str, list[int]] = {}
+    for index in np.lexsort((spread, dull)):
+        groups.setdefault(maps["group"][index], []).append(int(index))
+    in_turn = sorted((rank, index) for members in groups.values() for rank, index in enumerate(members))
+    return np.array([index for _, index in in_turn[:most]])
 
 
 def _where(maps: dict[str, np.ndarray], index: int) -> str:

@@ -133,12 +133,9 @@ def _read(path: Path, cell_size: float | None) -> list[Raster]:
 
 def _read_numpy(path: Path, cell_size: float | None) -> list[Raster]:
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
-            entries = {"heights": loaded}
-        else:
-            with loaded:
-                entries = dict(loaded)
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            entries = {"heights": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
         reason = str(error).splitlines() or ["it is cut short"]
         raise InputError(f"cannot be read as {path.suffix}: {reason[0]}") from None

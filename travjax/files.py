@@ -12,11 +12,16 @@ from travjax.config import InputError
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it becomes `path` when the block ends well, else it is removed."""
+    """A temporary name beside `path` to write to; it becomes `path` when the block ends well, else it is removed.
+
+    Raises InputError when it cannot be written: a full disk, a folder in the way.
+    """
     temporary = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         yield temporary
         temporary.replace(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -29,7 +29,7 @@ def _shares(name: str, failed: np.ndarray, known: np.ndarray) -> list:
     if not total:
         return [name, len(known), *["-"] * 5, "0.0%"]
     events = [failed[..., event][known].mean() for event in range(3)]
-    any_event: np.ndarray = np.asarray(failed.any(axis=-1))
+    any_event: np.ndarray = np.asarray(failed.any(axis=-1) & known)
     none = ~any_event[known.any(axis=-1)].any(axis=-1)
     return [
         name,
