@@ -110,6 +110,9 @@ SETTINGS = {
         replace(SEEKUR_JR, chassis_width=0.2, chassis_length=0.3),
         ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5), interval=0.1),
     ),
+    "chassis of few nodes": Setting(
+        replace(SEEKUR_JR, chassis_width=0.3, chassis_length=0.2), ActionSpace(turns=2, radii=STRAIGHT, interval=0.1)
+    ),
     "chassis with four nodes in all rows": Setting(
         SEEKUR_JR, ActionSpace(turns=1, radii=STRAIGHT, arc_lengths=(0.5, 0.5), interval=0.5)
     ),

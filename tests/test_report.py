@@ -98,10 +98,6 @@ def test_one_group_needs_no_overall_line():
     assert "overall" not in shares_table(["a", "a"], *ten_trajectories(2))
 
 
-def test_a_group_named_like_a_number_stays_as_it_is():
-    assert "1e3" in cells(shares_table(["1e3"], *ten_trajectories(1)))
-
-
 def test_rows_have_the_headings_and_order_of_the_columns():
     rows = [{"a": "x", "b": 1, "unused": 9}, {"a": "y", "b": 2}]
     assert rows_table(rows, {"b": "second", "a": "first"}).split() == [

@@ -213,6 +213,21 @@ def test_a_rock_between_chassis_and_wheels_or_outside_is_not_met(cells):
     np.testing.assert_allclose(as_array(margins)[AHEAD], 0, rtol=0, atol=1e-7)
 
 
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize(
+    ("width", "length", "cols", "rows"), [(0.44, 1.051, 3, 8), (0.3, 1.051, 2, 8), (0.3, 0.3, 2, 2)]
+)
+def test_ground_that_wheels_and_chassis_do_not_touch_does_not_matter(width, length, cols, rows, count):
+    """Walls all around a corridor for the chassis and two ruts for the wheels, 3.3 m long, just where they pass."""
+    row, col = Y / CELL, X / CELL
+    chassis = (abs(col) <= cols) & (row >= -rows) & (row <= (3.3 + length / 2) / CELL)
+    wheels = (abs(col) == 5) & (row >= -3) & (row <= 56)
+    heights = np.where(chassis | wheels, 0, 1).astype(np.float32)
+    robot = replace(SEEKUR_JR, chassis_width=width, chassis_length=length)
+    margins = simulate(np.stack([heights] * count), robot, ActionSpace(turns=2, radii=(math.inf,)))
+    np.testing.assert_allclose(margins.events()[:, AHEAD], 0, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 def test_turning_towards_a_rock_meets_it(side):
     """At the end of a quarter circle to its side stands a rock, away from all other quarter circles."""
