@@ -6,6 +6,7 @@ import io
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -22,6 +23,7 @@ from travjax.terrain import generate_terrain
 from travjax.traverse import label, unpacked
 
 SEEKUR_JR = Robot.load("seekur_jr")
+FRAIL = replace(SEEKUR_JR, max_step=0.02, ride_height=0.04, max_tilt=0.1)
 FEW = ActionSpace(turns=2, arc_lengths=(0.5, 0.6), radii=(math.inf, 1.5, -1.5), interval=0.1)
 FEW_TOML = "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n"
 GRID = Grid(3.75, 0.125)  # no other test compiles for it: the first call here is the one that compiles
@@ -101,15 +103,16 @@ def test_a_stream_labels_every_map_once_and_reports_its_progress(monkeypatch):
     monkeypatch.setattr(bench, "STREAM_CHUNK", 2)
     stored, done, packed = [], [], bench.packed
     monkeypatch.setattr(bench, "packed", lambda *labels: stored.append(np.asarray(packed(*labels))) or stored[-1])
-    row = bench.stream_row(3, SEEKUR_JR, FEW, GRID, done.append)
+    row = bench.stream_row(3, FRAIL, FEW, GRID, done.append)
     assert is_whole(row)
     assert row["maps"] == 3
     assert done == [2, 1]
     failed, known = unpacked(np.concatenate(stored))
     for number, style in enumerate(["mountain_crater", "smooth", "rough"]):
-        expected = label(generate_terrain(style, [number], grid=GRID), SEEKUR_JR, FEW, grid=GRID)
+        expected = label(generate_terrain(style, [number], grid=GRID), FRAIL, FEW, grid=GRID)
         np.testing.assert_array_equal(failed[number], expected[0])
     assert known.all()
+    assert len(np.unique(failed, axis=0)) == 3  # maps that can be told apart
 
 
 def test_a_start_is_the_median_of_new_processes_after_a_first_that_fills_the_cache(monkeypatch):
@@ -205,3 +208,15 @@ def test_the_command_prints_the_table_and_the_speed_up_and_writes_it_and_a_figur
     assert {path.name for path in folder.iterdir()} == {"bench.tsv", "bench.png"}
     for bar in ("kernels: 100%", "sequential simulator: 100%", "stream: 100%"):
         assert bar in err.getvalue()
+
+
+@pytest.mark.parametrize("text", ["radii = [inf, 0.2]", "turns = 2\nradii = [inf]\narc_lengths = [3.0, 3.0]"])
+def test_the_command_refuses_actions_that_do_not_fit_before_it_measures(tmp_path, monkeypatch, restored_cache, text):
+    (tmp_path / "bad.toml").write_text(text)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(bench, "start_row", lambda: pytest.fail("measured before it looked"))
+    err = io.StringIO()
+    with contextlib.redirect_stderr(err):
+        assert cli.main(["bench", "--actions", str(tmp_path / "bad.toml"), "--out", str(tmp_path / "out")]) == 2
+    assert len(err.getvalue().splitlines()) == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())

@@ -131,7 +131,7 @@ def test_batches_of_other_settings_agree_with_the_sequential_simulator(setting):
 @pytest.mark.gpu
 def test_a_gpu_agrees_with_the_sequential_simulator(maps, oracle):
     margins = simulate(np.stack(list(maps.values())))
-    assert {device.platform for device in margins.step.devices()} == {"gpu"}
+    assert margins.step.devices() <= set(jax.devices("gpu"))
     for index, (sample, expected) in enumerate(oracle.values()):
         assert_agrees(of_map(margins, index), expected, sample, SEEKUR_JR)
 
@@ -213,9 +213,9 @@ def test_a_rock_between_chassis_and_wheels_or_outside_is_not_met(cells):
     np.testing.assert_allclose(as_array(margins)[AHEAD], 0, rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize(
-    ("width", "length", "cols", "rows"), [(0.44, 1.051, 3, 8), (0.3, 1.051, 2, 8), (0.3, 0.3, 2, 2)]
+    ("width", "length", "cols", "rows", "count"),
+    [(0.44, 1.051, 3, 8, 1), (0.3, 1.051, 2, 8, 1), (0.3, 0.3, 2, 2, 1), (0.3, 1.051, 2, 8, 3)],
 )
 def test_ground_that_wheels_and_chassis_do_not_touch_does_not_matter(width, length, cols, rows, count):
     """Walls all around a corridor for the chassis and two ruts for the wheels, 3.3 m long, just where they pass."""
@@ -224,7 +224,7 @@ def test_ground_that_wheels_and_chassis_do_not_touch_does_not_matter(width, leng
     wheels = (abs(col) == 5) & (row >= -3) & (row <= 56)
     heights = np.where(chassis | wheels, 0, 1).astype(np.float32)
     robot = replace(SEEKUR_JR, chassis_width=width, chassis_length=length)
-    margins = simulate(np.stack([heights] * count), robot, ActionSpace(turns=2, radii=(math.inf,)))
+    margins = simulate(np.stack([heights] * count), robot, ActionSpace(turns=2, radii=(math.inf,), interval=0.11))
     np.testing.assert_allclose(margins.events()[:, AHEAD], 0, rtol=0, atol=1e-7)
 
 
@@ -308,7 +308,7 @@ def test_mirroring_the_map_permutes_the_trajectories(heights):
 @given(grounds())
 def test_turning_the_map_by_90_degrees_permutes_the_trajectories(heights):
     """No view of the tables turns by 90 degrees; anticlockwise is clockwise for rows that count downwards."""
-    actions = ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5, 3.0))
+    actions = ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5, 3.0), interval=0.13)
     assert_permuted(heights, np.rot90(heights, -1), turned(np.arange(len(actions)), actions, part=4), actions)
 
 
