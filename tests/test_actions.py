@@ -194,6 +194,20 @@ def test_a_wrong_value_in_a_file_is_named_with_the_file(tmp_path):
         ActionSpace.load(path)
 
 
+@pytest.mark.parametrize("as_radii", [list, np.array])
+def test_lists_and_arrays_become_tuples(as_radii):
+    actions = ActionSpace(turns=np.int64(4), arc_lengths=[1, 2], radii=as_radii([math.inf, 1.5]))
+    assert actions == ActionSpace(turns=4, arc_lengths=(1.0, 2.0), radii=(math.inf, 1.5))
+    assert hash(actions) == hash(ActionSpace(turns=4, arc_lengths=(1.0, 2.0), radii=(math.inf, 1.5)))
+
+
+@pytest.mark.parametrize("trajectory", [-1, 3042, [0, 5000]])
+def test_a_trajectory_that_is_none_is_refused(trajectory):
+    for function in (ActionSpace().split, ActionSpace().poses):
+        with pytest.raises(InputError, match="^trajectory = .*: must be from 0 to 3041$"):
+            function(np.array(trajectory))
+
+
 def test_equal_action_spaces_are_one_key():
     assert {ActionSpace(): 1}[ActionSpace(turns=18)] == 1
 
@@ -239,3 +253,15 @@ def test_a_radius_twice_is_refused():
 def test_a_bad_interval_is_refused(interval):
     with pytest.raises(InputError, match="^interval = .*: must be a length in metres, at most an arc's length$"):
         ActionSpace(arc_lengths=(0.5, 1.0), interval=interval)
+
+
+def test_an_interval_that_makes_thousands_of_poses_is_refused():
+    assert ActionSpace(turns=1, arc_lengths=(0.5, 1.0), interval=0.001).poses(0).shape == (1501, 3)
+    with pytest.raises(InputError, match="^interval = 0.00099: must be at least a thousandth of an arc, 0.001 m$"):
+        ActionSpace(turns=1, arc_lengths=(0.5, 1.0), interval=0.00099)
+
+
+def test_too_many_trajectories_are_refused():
+    assert len(ActionSpace(turns=1, radii=tuple(range(1, 1001)))) == 1_000_000
+    with pytest.raises(InputError, match="^turns x radii x radii = 1002001: must be at most 1000000 trajectories$"):
+        ActionSpace(turns=1, radii=tuple(range(1, 1002)))

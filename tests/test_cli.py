@@ -138,8 +138,8 @@ def test_the_configuration_in_the_file_makes_robot_actions_and_grid_again(synthe
     arrays = synthetic.arrays()
     config = json.loads(str(arrays["config"]))
     assert Robot(**config["robot"]) == SEEKUR_JR
-    lists = {name: tuple(value) if isinstance(value, list) else value for name, value in config["actions"].items()}
-    assert ActionSpace(**lists) == ActionSpace()
+    radii = [float(radius) for radius in config["actions"]["radii"]]
+    assert ActionSpace(**config["actions"] | {"radii": radii}) == ActionSpace()
     assert Grid(**config["grid"]) == Grid()
     assert config["travjax"] == travjax.__version__
     assert arrays["cell_size"] == CELL
@@ -533,15 +533,15 @@ BAD_WORDS = {
     ),
     "trajectories that leave the map": (
         ["label", "--count", "1", "--actions", "BAD/far.toml"],
-        "actions: trajectories leave the 8 m map by 2.5 m; allowed: ",
+        "arc_lengths = .*: trajectories leave the 8 m map by 2.5 m; allowed: ",
     ),
     "trajectories that leave a small map": (
         ["label", "--count", "1", "--size", "4"],
-        "actions: trajectories leave the 4 m map by .* m; allowed: ",
+        "arc_lengths = .*: trajectories leave the 4 m map by .* m; allowed: ",
     ),
     "trajectories that leave the window of a DEM": (
         ["label", "BAD/good.npz", "--size", "4"],
-        "actions: trajectories leave the 4 m map by .* m; allowed: ",
+        "arc_lengths = .*: trajectories leave the 4 m map by .* m; allowed: ",
     ),
     "nodes too far apart": (["label", "--count", "1", "--spacing", "1"], "spacing = 1: too coarse for Seekur Jr"),
     "size of 0": (["label", "--size", "0"], "size = 0.0: must be"),

@@ -1,8 +1,9 @@
 """Configurations from TOML files, and the one line that says what is wrong with one."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 
 from travjax.config import InputError, load_toml, require, require_number
@@ -11,7 +12,7 @@ from travjax.config import InputError, load_toml, require, require_number
 @dataclass(frozen=True)
 class Ramp:
     length: float
-    slope: float
+    slope: float = field(metadata={"angle": True})
     marks: tuple[float, ...] = (0.0,)
 
     def __post_init__(self):
@@ -101,6 +102,15 @@ def test_a_refused_value_is_named_with_file_field_and_what_is_allowed(ramp_file)
     assert message == "length = -2: must be a length in metres, above 0 and at most 100"
 
 
+def test_only_angles_may_be_in_degrees(ramp_file):
+    assert refusal(ramp_file("length_deg = 1\nslope = 0")) == "unknown key 'length_deg'; allowed: length, slope, marks"
+
+
+@pytest.mark.parametrize("text", ["slope = 0.1\nslope_deg = 5", "slope_deg = 5\nslope = 0.1"])
+def test_an_angle_may_be_given_once(ramp_file, text):
+    assert "is given twice, once in degrees; allowed: once" in refusal(ramp_file(f"length = 1\n{text}"))
+
+
 @pytest.mark.parametrize("value", ["'30'", "true", "nan", "inf", "[30]"])
 def test_degrees_must_be_a_number(ramp_file, value):
     message = refusal(ramp_file(f"length = 1\nslope_deg = {value}"))
@@ -113,16 +123,25 @@ def test_bad_input_is_a_value_error():
         require(False, "field", "x", "y")
 
 
+def test_a_long_value_is_shortened_to_one_line():
+    with pytest.raises(InputError) as raised:
+        require(False, "field", np.zeros((20, 20)), "small")
+    message = str(raised.value)
+    assert message.startswith("field = array([[0., 0., ")
+    assert message.endswith(" ...: must be small")
+    assert "\n" not in message and len(message) < 120
+
+
 def test_what_holds_is_not_refused():
     require(True, "field", "x", "y")
 
 
-@pytest.mark.parametrize("value", [0.1, 1, 2, 2.0])
+@pytest.mark.parametrize("value", [0.1, 1, 2, 2.0, np.float32(0.5), np.int64(1)])
 def test_a_number_within_the_bounds_is_allowed(value):
     require_number("field", value, 0, 2, "above 0, at most 2")
 
 
-@pytest.mark.parametrize("value", [0, 2.0001, -1, math.nan, math.inf, -math.inf, "1", None, True, [1], 1j])
+@pytest.mark.parametrize("value", [0, 2.0001, -1, 10**400, math.nan, math.inf, -math.inf, "1", None, True, [1], 1j])
 def test_what_is_no_finite_number_within_the_bounds_is_refused(value):
     with pytest.raises(InputError, match="^field = .*: must be above 0, at most 2$"):
         require_number("field", value, 0, 2, "above 0, at most 2")

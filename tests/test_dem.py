@@ -155,7 +155,7 @@ def test_a_file_without_a_place_has_its_origin_at_zero(tmp_path):
         (256, 192, 4, [0, 64], [0]),
         (161, 129, 1.01, [0, 16, 32], [0]),
         (161, 129, 0.99, [0, 16, 32], [0]),
-        (131, 130, 0.001, [0, 1, 2], [0, 1]),
+        (131, 130, 0.0625, [0, 1, 2], [0, 1]),
         (300, 300, 1000, [0], [0]),
     ],
 )
@@ -643,10 +643,56 @@ def test_a_raster_that_is_not_georeferenced_wants_a_cell_size(tmp_path):
 
     heights = uneven(NODES, NODES) % 250
     Image.fromarray(heights[::-1].astype(np.uint8)).save(tmp_path / "site.png")
-    assert refusal(tmp_path / "site.png").startswith("cell_size is missing: ")
-    windows = load_dem(tmp_path / "site.png", cell_size=CELL)
-    np.testing.assert_array_equal(absolute(windows)[0], np.floor(heights))
+    assert refusal(tmp_path / "site.png", height_scale=0.5).startswith("cell_size is missing: ")
+    assert refusal(tmp_path / "site.png", cell_size=CELL).startswith("height_scale is missing: a PNG holds no metres")
+    windows = load_dem(tmp_path / "site.png", cell_size=CELL, height_scale=0.5)
+    np.testing.assert_array_equal(absolute(windows)[0], 0.5 * np.floor(heights))
     assert windows.origins.tolist() == [[0, 0]]
+
+
+def test_scale_and_offset_of_a_band_are_applied(tmp_path):
+    millimetres = np.round(uneven(NODES, NODES) * 1000).astype(np.int32)
+    path = write_geotiff(tmp_path / "site.tif", millimetres)
+    with rasterio.open(path, "r+") as file:
+        file.scales, file.offsets = (0.001,), (100.0,)
+    np.testing.assert_allclose(absolute(load_dem(path))[0], 100 + millimetres / 1000, rtol=0, atol=1e-5)
+
+
+def test_a_system_in_feet_is_refused(tmp_path):
+    for crs in ("EPSG:2263", 'LOCAL_CS["yard",UNIT["foot",0.3048]]'):
+        path = write_geotiff(tmp_path / "site.tif", uneven(NODES, NODES), crs=crs)
+        assert "is in units of 0.3048" in refusal(path)
+
+
+def test_a_cell_size_that_contradicts_the_file_is_refused(tmp_path):
+    for path in (
+        write_geotiff(tmp_path / "site.tif", uneven(NODES, NODES)),
+        write_npz(tmp_path / "site.npz", uneven(NODES, NODES)),
+    ):
+        assert refusal(path, cell_size=0.05) == "cell_size = 0.05: must be left out: the file says 0.0625"
+        assert load_dem(path, cell_size=CELL).cell_size == CELL
+
+
+def test_a_nodata_value_is_compared_as_the_file_holds_it(tmp_path):
+    heights = uneven(NODES, NODES).astype(np.float32)
+    heights[:40, :40] = -99.9
+    windows = load_dem(write_geotiff(tmp_path / "site.tif", heights), nodata=-99.9)
+    assert np.isnan(windows.heights[0, :30, :30]).all()
+    assert np.isfinite(windows.heights[0, 45:, 45:]).all()
+
+
+def test_maps_of_an_npz_keep_their_own_origins(tmp_path):
+    heights = np.stack([uneven(NODES, NODES)] * 2)
+    path = write_npz(tmp_path / "maps.npz", heights, origin=[[1.0, 2.0], [9.0, 2.0]], height_offset=[5.0, 7.0])
+    windows = load_dem(path)
+    assert windows.origins.tolist() == [[1, 2], [9, 2]]
+    np.testing.assert_allclose(windows.heights[1] - windows.heights[0], 2, rtol=0, atol=1e-5)
+
+
+def test_a_stride_below_the_spacing_is_refused(tmp_path):
+    path = write_npz(tmp_path / "site.npz", uneven(NODES, NODES))
+    with pytest.raises(InputError, match="^stride = 0.01: must be at least the spacing of the nodes, 0.0625 m$"):
+        load_dem(path, stride=0.01)
 
 
 @pytest.mark.parametrize("value", [0, -0.0625, np.nan, np.inf, 1001, "0.0625", [0.1, 0.2], True, 1j])

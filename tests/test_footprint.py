@@ -293,26 +293,30 @@ def test_a_chassis_that_ends_on_the_last_row_stays_on_the_map():
 
 def test_a_chassis_that_leaves_the_map_is_refused():
     robot = replace(SEEKUR_JR, chassis_length=2.0)
-    with pytest.raises(InputError, match="^actions: trajectories leave the 8.4 m map by 0.1 m; allowed: arcs short"):
+    with pytest.raises(
+        InputError, match=r"^arc_lengths = \(1.65, 1.65\): trajectories leave the 8.4 m map by 0.1 m; allowed"
+    ):
         node_table(robot, STRAIGHT, Grid(8.4, 0.05))
 
 
 def test_a_wheel_that_leaves_the_map_is_refused():
     robot = replace(SEEKUR_JR, wheelbase=2.0)
     assert len(node_table(robot, STRAIGHT, Grid(8.6, 0.05)).source) == 1
-    with pytest.raises(InputError, match="^actions: trajectories leave the 8.4 m map by 0.1 m; allowed: arcs short"):
+    with pytest.raises(
+        InputError, match=r"^arc_lengths = \(1.65, 1.65\): trajectories leave the 8.4 m map by 0.1 m; allowed"
+    ):
         node_table(robot, STRAIGHT, Grid(8.4, 0.05))
 
 
 @pytest.mark.parametrize("turns", [2, 4])
 def test_a_map_that_is_left_to_any_side_is_refused(turns):
-    with pytest.raises(InputError, match="^actions: trajectories leave the 4 m map"):
+    with pytest.raises(InputError, match="^arc_lengths = .*: trajectories leave the 4 m map"):
         node_table(SEEKUR_JR, ActionSpace(turns=turns, radii=(math.inf,)), Grid(4, 0.0625))
 
 
 def test_a_robot_wider_than_the_map_is_refused():
     actions = ActionSpace(turns=1, radii=(math.inf,), arc_lengths=(0.1, 0.1))
-    with pytest.raises(InputError, match="^actions: trajectories leave the 1 m map by 0.125 m"):
+    with pytest.raises(InputError, match="^arc_lengths = .*: trajectories leave the 1 m map by 0.125 m"):
         node_table(replace(SEEKUR_JR, chassis_width=1.3, chassis_length=0.2), actions, Grid(1, 0.125))
 
 
@@ -321,6 +325,12 @@ def test_a_chassis_that_falls_between_the_nodes_is_refused_with_a_spacing_that_w
     with pytest.raises(InputError, match="^spacing = 0.0625: too coarse for Seekur Jr.*; allowed: up to 0.0424 m$"):
         node_table(robot, ActionSpace(), Grid())
     assert len(node_table(robot, ActionSpace(), Grid(8, 0.04)).source) == 3042
+
+
+def test_a_table_cannot_be_written_to():
+    table = node_table(SEEKUR_JR, STRAIGHT, Grid())
+    with pytest.raises(ValueError, match="read-only"):
+        table.wheels[0] = 0
 
 
 def test_the_same_table_is_built_once():

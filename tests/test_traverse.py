@@ -396,6 +396,29 @@ def test_float32_heights_at_1000_metres_lose_nothing_that_they_hold(maps, conver
     assert_same(simulate(convert(heights + np.float32(1000))), simulate(heights))
 
 
+def test_masked_nodes_are_unknown(maps):
+    heights = maps["holes"]
+    masked = np.ma.masked_invalid(heights)
+    assert_same(simulate(masked), simulate(heights))
+    assert_same(simulate(np.ma.masked_array(np.nan_to_num(heights), masked.mask)), simulate(heights))
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 30_001, -3.4e38])
+@pytest.mark.parametrize("node", [(100, 64), (100, 69), (64, 64)], ids=["chassis", "wheel", "centre"])
+def test_heights_of_jax_arrays_that_are_none_are_unknown(value, node):
+    heights, unknown = jnp.asarray(flat()).at[node].set(value), jnp.asarray(flat()).at[node].set(jnp.nan)
+    margins = simulate(heights)
+    assert not margins.known[AHEAD]
+    assert_same(margins, simulate(unknown), atol=0)
+
+
+def test_a_robot_may_be_named(maps):
+    heights, robot = maps["scattered_sharp"], Robot.load("leo_rover")
+    actions = ActionSpace(turns=2, interval=0.11)
+    assert_same(simulate(heights, "leo_rover", actions), simulate(heights, robot, actions), atol=0)
+    np.testing.assert_array_equal(label(heights, "leo_rover", actions), label(heights, robot, actions))
+
+
 def test_heights_are_not_changed(maps):
     heights = maps["holes"].astype(np.float64) + 2000
     before = heights.copy()
@@ -438,7 +461,7 @@ def test_a_height_that_is_none_is_refused(value, dtype):
 
 
 def test_trajectories_that_leave_the_map_are_refused():
-    with pytest.raises(InputError, match="^actions: trajectories leave the 4 m map"):
+    with pytest.raises(InputError, match="^arc_lengths = .*: trajectories leave the 4 m map"):
         simulate(np.zeros((65, 65)), grid=Grid(4))
 
 

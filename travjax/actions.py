@@ -6,7 +6,7 @@ heading anticlockwise from +y. The point turn itself is not simulated. Everythin
 
 import math
 from dataclasses import dataclass
-from numbers import Real
+from numbers import Integral, Real
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,10 @@ class ActionSpace:
     interval: float = 0.06
 
     def __post_init__(self):
-        whole = isinstance(self.turns, int) and not isinstance(self.turns, bool)
+        for name in ("arc_lengths", "radii"):
+            if isinstance(getattr(self, name), list | np.ndarray):
+                object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+        whole = isinstance(self.turns, Integral) and not isinstance(self.turns, bool)
         require(whole and 1 <= self.turns <= 3600, "turns", self.turns, "a whole number from 1 to 3600")
         pair = isinstance(self.arc_lengths, tuple) and len(self.arc_lengths) == 2
         require(pair, "arc_lengths", self.arc_lengths, "two lengths in metres")
@@ -56,8 +59,11 @@ class ActionSpace:
                 "a radius in metres, not 0; inf is straight",
             )
         require(len(set(self.radii)) == len(self.radii), "radii", self.radii, "different from each other")
-        require_number(
-            "interval", self.interval, 0, min(self.arc_lengths), "a length in metres, at most an arc's length"
+        require(len(self) <= 1_000_000, "turns x radii x radii", len(self), "at most 1000000 trajectories")
+        require_number("interval", self.interval, 0, min(self.arc_lengths), "metres, at most the length of an arc")
+        shortest = max(self.arc_lengths) / 1000
+        require(
+            self.interval >= shortest, "interval", self.interval, f"at least a thousandth of an arc, {shortest:g} m"
         )
 
     @staticmethod
@@ -74,7 +80,9 @@ class ActionSpace:
         return (turn * len(self.radii) + first) * len(self.radii) + second
 
     def split(self, trajectory):
-        """The (turn, first, second) of a trajectory index."""
+        """The (turn, first, second) of a trajectory index; raises InputError when there is no such trajectory."""
+        outside = np.ravel(trajectory)[(np.ravel(trajectory) < 0) | (np.ravel(trajectory) >= len(self))]
+        require(not outside.size, "trajectory", outside[:1].tolist(), f"from 0 to {len(self) - 1}")
         arcs, second = np.divmod(trajectory, len(self.radii))
         turn, first = np.divmod(arcs, len(self.radii))
         return turn, first, second

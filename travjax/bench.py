@@ -19,6 +19,8 @@ import numpy as np
 
 from travjax import reference
 from travjax.actions import ActionSpace
+from travjax.config import InputError
+from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import STYLES, generate_terrain
@@ -29,6 +31,7 @@ COLUMNS = {
     "maps": "maps at once",
     "ms_per_map": "ms a map",
     "trajectories_per_s": "trajectories/s",
+    "speed_up": "x sequential",
     "first_call_s": "first call s (compiles)",
     "repeats": "repeats",
     "peak_mib": "peak memory so far MiB",
@@ -36,6 +39,7 @@ COLUMNS = {
 
 BATCHES = (1, 8, 32, 128)
 STREAM_CHUNK = 320
+SEQUENTIAL = "sequential NumPy simulator"
 
 
 def machine() -> str:
@@ -43,6 +47,16 @@ def machine() -> str:
     device = jax.devices()[0]
     versions = f"jax {jax.__version__}, Python {platform.python_version()}"
     return f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
+
+
+def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+    """Raises InputError when robot, actions and grid do not fit together for the one simulator or the other."""
+    node_table(robot, actions, grid)
+    try:
+        for trajectory in range(0, len(actions), len(actions.radii) ** 2):
+            reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)
+    except ValueError as error:
+        raise InputError(f"sequential simulator: {' '.join(str(error).split())}") from None
 
 
 def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
@@ -63,7 +77,7 @@ def reference_row(robot: Robot, actions: ActionSpace, grid: Grid, on_progress: C
     heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
     start = time.perf_counter()
     reference.simulate(heights, robot, actions, cell_size=grid.spacing, on_progress=on_progress)
-    return _row("sequential NumPy simulator", 1, time.perf_counter() - start, len(actions), None, 1)
+    return _row(SEQUENTIAL, 1, time.perf_counter() - start, len(actions), None, 1)
 
 
 def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
@@ -86,15 +100,24 @@ def start_row() -> dict:
         with tempfile.TemporaryDirectory() as folder:
             start = time.perf_counter()
             command = [sys.executable, "-m", "travjax", "label", "--count", "1", "--no-figures", "--out", folder]
-            subprocess.run(command, check=True, capture_output=True)
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                raise InputError(f"{' '.join(command)}: {done.stderr.strip().splitlines()[-1:]}")
             seconds.append(time.perf_counter() - start)
     return _row("command line, one map", 1, statistics.median(seconds[1:]), 0, None, 3, resource.RUSAGE_CHILDREN)
 
 
+def with_speed_up(rows: list[dict]) -> list[dict]:
+    """The rows with how many times faster than the sequential simulator each labels a map."""
+    sequential = next(row["ms_per_map"] for row in rows if row["what"] == SEQUENTIAL)
+    simulates = lambda row: row["trajectories_per_s"] is not None
+    return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
+
+
 def write_tsv(rows: list[dict], path: Path) -> None:
-    """One line for each row, the keys of COLUMNS as header."""
-    lines = ["\t".join("" if row[key] is None else str(row[key]) for key in COLUMNS) for row in rows]
-    path.write_text("\n".join(["\t".join(COLUMNS), *lines]) + "\n")
+    """One line for each row, the keys of COLUMNS and `machine` as header."""
+    cells = [[*("" if row[key] is None else str(row[key]) for key in COLUMNS), machine()] for row in rows]
+    path.write_text("\n".join("\t".join(line) for line in [[*COLUMNS, "machine"], *cells]) + "\n")
 
 
 def _mixture(first: int, count: int) -> tuple[list[str], range]:
@@ -124,6 +147,7 @@ def _row(
         "maps": maps,
         "ms_per_map": seconds / maps * 1e3,
         "trajectories_per_s": maps * trajectories / seconds if trajectories else None,
+        "speed_up": None,
         "first_call_s": first,
         "repeats": repeats,
         "peak_mib": resource.getrusage(whose).ru_maxrss / 1024,

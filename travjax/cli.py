@@ -36,6 +36,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"travjax: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # the reader of our output has gone
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except KeyboardInterrupt:
         print("travjax: interrupted", file=sys.stderr)
         return 130
@@ -68,12 +71,16 @@ def _parser() -> argparse.ArgumentParser:
     )
     label.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
     _add_synthetic(label, count=200, each="maps in all, the styles in turn")
-    label.add_argument("--stride", type=float, default=8.0, metavar="M", help="metres between windows of a DEM (8)")
+    label.add_argument("--stride", type=float, metavar="M", help="metres between windows of a DEM (8)")
     label.add_argument(
         "--cell-size", type=float, metavar="M", help="metres between a DEM's values, if the file does not say"
     )
+    label.add_argument("--height-scale", type=float, metavar="M", help="metres per unit of a DEM's values (1)")
     label.add_argument(
-        "--nodata", type=float, metavar="Z", help="height that marks unknown ground, if the file does not say"
+        "--nodata",
+        type=float,
+        metavar="Z",
+        help="value that marks unknown ground, if the file does not say; as in --nodata=-9999",
     )
     label.add_argument(
         "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m of known ground"
@@ -131,6 +138,10 @@ def _use_compilation_cache() -> None:
     """Compiled code is kept between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "travjax" / "jax"
+        try:
+            output_folder(cache)
+        except InputError:
+            return
         jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -152,26 +163,27 @@ def _terrain(arguments: argparse.Namespace) -> None:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
         titles = [f"seed {seed}" for seed in maps["seed"][chosen]]
         print(
-            plots.save(plots.contact_sheet(maps["heights"][chosen], titles, style, grid), out / f"terrain_{style}.png")
+            plots.save(
+                plots.contact_sheet(maps["heights"][chosen], titles, f"{style}: {len(chosen)} of {count} maps", grid),
+                out / f"terrain_{style}.png",
+            )
         )
 
 
 def _label(arguments: argparse.Namespace) -> None:
-    grid, robot, actions = Grid(arguments.size, arguments.spacing), Robot.load(arguments.robot), _actions(arguments)
+    grid, robot, actions = _configuration(arguments)
+    dem_options = ("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse")
+    unused = ("style", "count", "seed") if arguments.dem else dem_options
+    for name in unused:
+        given = getattr(arguments, name)
+        allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
+        require(given is None or given is False, f"--{name.replace('_', '-')}", given, allowed)
     if arguments.dem:
-        for name in ("style", "count", "seed"):
-            require(
-                getattr(arguments, name) is None,
-                f"--{name}",
-                getattr(arguments, name),
-                "left out where DEM files are given",
-            )
-        total, source = _dem_windows(arguments, grid)
+        total, source, files = _dem_windows(arguments, grid)
     else:
         styles, total, seed = arguments.style or list(STYLES), _count(arguments), _seed(arguments)
         names = [styles[number % len(styles)] for number in range(total)]
-        source = _synthetic(names, list(range(seed, seed + total)), grid)
-    node_table(robot, actions, grid)  # refuses what does not fit together before anything is made
+        source, files = _synthetic(names, list(range(seed, seed + total)), grid), []
     out = output_folder(arguments.out)
 
     labelled = []
@@ -182,7 +194,7 @@ def _label(arguments: argparse.Namespace) -> None:
     maps = _joined(labelled)
 
     table = report.shares_table(maps["group"], maps["failed"], maps["known"])
-    labels = save_npz(out / "labels.npz", config=_config(robot, actions, grid), cell_size=grid.spacing, **maps)
+    labels = save_npz(out / "labels.npz", config=_config(robot, actions, grid, files), cell_size=grid.spacing, **maps)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(table + "\n")
     print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
@@ -202,7 +214,8 @@ def _label(arguments: argparse.Namespace) -> None:
 def _bench(arguments: argparse.Namespace) -> None:
     from travjax import bench, plots
 
-    grid, robot, actions = Grid(arguments.size, arguments.spacing), Robot.load(arguments.robot), _actions(arguments)
+    grid, robot, actions = _configuration(arguments)
+    bench.check(robot, actions, grid)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.stream >= 0, "--stream", arguments.stream, "at least 0")
     out = output_folder(arguments.out)
@@ -216,21 +229,24 @@ def _bench(arguments: argparse.Namespace) -> None:
     if arguments.stream:
         with tqdm(desc="stream", total=arguments.stream, unit="map") as bar:
             rows.append(bench.stream_row(arguments.stream, robot, actions, grid, bar.update))
-    speed = {row["maps"]: row["ms_per_map"] for row in rows if row["what"] == "labelling"}
-    sequential = next(row["ms_per_map"] for row in rows if row["what"].startswith("sequential"))
+    rows = bench.with_speed_up(rows)
     print(f"\n{bench.machine()}\n{report.rows_table(rows, bench.COLUMNS)}\n")
-    print(
-        f"batched against sequential: {sequential / speed[1]:,.0f} x for one map, "
-        f"{sequential / speed[32]:,.0f} x in batches of 32\n"
-    )
     with written_whole(out / "bench.tsv") as temporary:
         bench.write_tsv(rows, temporary)
     print(out / "bench.tsv")
-    print(
-        plots.save(
-            plots.speed_figure([row for row in rows if row["what"] in ("terrain", "labelling")]), out / "bench.png"
-        )
-    )
+    kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
+    print(plots.save(plots.speed_figure(kernels), out / "bench.png"))
+
+
+def _configuration(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
+    """Grid, robot and action space; refuses what does not fit together before anything is made."""
+    grid, robot, actions = Grid(arguments.size, arguments.spacing), Robot.load(arguments.robot), _actions(arguments)
+    try:
+        node_table(robot, actions, grid)
+    except InputError as error:
+        given = [str(source) for source in (arguments.robot, arguments.actions) if source]
+        raise InputError(f"{' with '.join(given)}: {error}") from None
+    return grid, robot, actions
 
 
 def _actions(arguments: argparse.Namespace) -> ActionSpace:
@@ -263,39 +279,46 @@ def _synthetic(styles: list[str], seeds: list[int], grid: Grid) -> Iterator[dict
         }
 
 
-def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[dict[str, Any]]]:
-    """The number of windows of all files, and batches of them with where they come from."""
-    files = []
+def _dem_windows(
+    arguments: argparse.Namespace, grid: Grid
+) -> tuple[int, Iterator[dict[str, Any]], list[dict[str, Any]]]:
+    """The number of windows of all files, batches of them with where they come from, and how each file was read."""
+    options: dict[str, Any] = {
+        "stride": 8.0 if arguments.stride is None else arguments.stride,
+        "cell_size": arguments.cell_size,
+        "height_scale": arguments.height_scale,
+        "nodata": arguments.nodata,
+        "fill_holes": not arguments.keep_holes,
+        "allow_coarse": arguments.allow_coarse,
+    }
+    names = [path.name for path in arguments.dem]
+    files, notes = [], []
     for path in arguments.dem:
-        windows = load_dem(
-            path,
-            arguments.stride,
-            grid=grid,
-            cell_size=arguments.cell_size,
-            nodata=arguments.nodata,
-            fill_holes=not arguments.keep_holes,
-            allow_coarse=arguments.allow_coarse,
-        )
+        windows = load_dem(path, grid=grid, **options)
+        crs = (windows.crs or "none").partition(",")[0]
         print(
-            f"{path}: {len(windows.heights)} windows, cells of {windows.cell_size:g} m, crs {windows.crs or 'none'}, "
+            f"{path}: {len(windows.heights)} windows, cells of {windows.cell_size:g} m, crs {crs}, "
             f"{windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
         )
-        files.append(windows)
+        files.append((path.name if names.count(path.name) == 1 else str(path), windows))
+        read = {
+            name: getattr(windows, name) for name in ("path", "sha256", "crs", "height_offset", "filled", "unknown")
+        }
+        notes.append(read | options | {"cell_size": windows.cell_size})
 
     def batches():
-        for windows in files:
+        for name, windows in files:
             for start in range(0, len(windows.heights), BATCH):
                 heights = windows.heights[start : start + BATCH]
-                one = {
-                    "group": Path(windows.path).name,
-                    "sha256": windows.sha256,
-                    "crs": windows.crs or "",
-                    "height_offset": windows.height_offset,
+                yield {
+                    "heights": heights,
+                    "group": np.full(len(heights), name),
+                    "origin": windows.origins[start : start + BATCH],
+                    "height_offset": np.full(len(heights), windows.height_offset),
+                    "crs": np.full(len(heights), windows.crs or ""),
                 }
-                repeated = {key: np.array([value] * len(heights)) for key, value in one.items()}
-                yield {"heights": heights, "origin": windows.origins[start : start + BATCH], **repeated}
 
-    return sum(len(windows.heights) for windows in files), batches()
+    return sum(len(windows.heights) for _, windows in files), batches(), notes
 
 
 def _progress(batches: Iterator[dict[str, Any]], total: int, what: str) -> Iterator[dict[str, Any]]:
@@ -309,9 +332,11 @@ def _joined(batches: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
 
 
-def _config(robot: Robot, actions: ActionSpace, grid: Grid) -> str:
+def _config(robot: Robot, actions: ActionSpace, grid: Grid, files: list[dict[str, Any]]) -> str:
+    """All that the labels depend on, as JSON; a straight arc's radius is "inf"."""
     parts = {name: dataclasses.asdict(part) for name, part in (("robot", robot), ("actions", actions), ("grid", grid))}
-    return json.dumps(parts | {"travjax": travjax.__version__})
+    parts["actions"]["radii"] = ["inf" if np.isinf(radius) else radius for radius in actions.radii]
+    return json.dumps(parts | {"files": files, "travjax": travjax.__version__}, allow_nan=False)
 
 
 def _samples(maps: dict[str, np.ndarray], most: int = 5) -> np.ndarray:

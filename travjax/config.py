@@ -1,16 +1,17 @@
 """What every configuration shares: one-line errors and checked TOML files.
 
-A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file a key that
-ends in `_deg` holds degrees; everything else is named as the field is.
+A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
+may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is.
 """
 
 import dataclasses
 import math
 import textwrap
 import tomllib
-from numbers import Real
 from pathlib import Path
-from typing import TypeVar, cast
+from typing import TypeVar
+
+import numpy as np
 
 Config = TypeVar("Config")
 
@@ -22,14 +23,19 @@ class InputError(ValueError):
 def require(condition: bool, field: str, value: object, allowed: str) -> None:
     """Raises InputError "field = value: must be allowed" unless the condition holds."""
     if not condition:
-        shown = textwrap.shorten(repr(value), 80, placeholder=" ...")
+        plain = value.item() if isinstance(value, np.generic) else value
+        shown = textwrap.shorten(repr(plain), 80, placeholder=" ...")
         raise InputError(f"{field} = {shown}: must be {allowed}")
 
 
 def require_number(field: str, value: object, low: float, high: float, allowed: str) -> None:
     """Raises InputError unless `value` is a finite number with low < value <= high."""
-    number = isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
-    require(number and low < float(cast(float, value)) <= high, field, value, allowed)
+    real = isinstance(value, int | float | np.number) and not isinstance(value, bool | np.complexfloating)
+    try:
+        number = float(value) if real else math.nan  # type: ignore[arg-type]
+    except OverflowError:
+        number = math.nan
+    require(low < number <= high, field, value, allowed)
 
 
 def load_toml(path: str | Path, kind: type[Config]) -> Config:
@@ -57,9 +63,12 @@ def _fields_from(table: dict, kind: type) -> dict:
     values = {}
     for key, value in table.items():
         name = key.removesuffix("_deg")
-        if name not in names:
+        degrees = key != name
+        if name not in names or degrees and not names[name].metadata.get("angle"):
             raise InputError(f"unknown key {key!r}; allowed: {', '.join(names)}")
-        if key != name:
+        if name in values:
+            raise InputError(f"{key} = {value!r}: is given twice, once in degrees; allowed: once")
+        if degrees:
             require_number(key, value, -math.inf, math.inf, "a number of degrees")
             value = math.radians(value)
         values[name] = tuple(value) if isinstance(value, list) else value

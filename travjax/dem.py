@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from travjax.config import InputError, require, require_number
-from travjax.grid import Grid
+from travjax.grid import HIGHEST, Grid
 
 FILL_DISTANCE = 0.125
 """Metres: a hole is filled when each of its nodes is this near to known ground."""
@@ -22,8 +22,11 @@ FILL_DISTANCE = 0.125
 COARSEST = 0.125
 """Metres: cells larger than this do not show a step or a rock."""
 
-LOWEST, HIGHEST = -12_000.0, 30_000.0
-"""Metres: heights outside are no heights; a missing-value marker that the file does not declare, say."""
+LOWEST = -12_000.0
+"""Metres: what is deeper is no height; HIGHEST is in grid.py."""
+
+MARKERS = (-9999, -99999, -32768, 9999)
+"""Usual marks of unknown ground that some files do not declare."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +76,7 @@ def load_dem(
     *,
     grid: Grid = Grid(),
     cell_size: float | None = None,
+    height_scale: float | None = None,
     nodata: float | None = None,
     fill_holes: bool = True,
     allow_coarse: bool = False,
@@ -83,22 +87,28 @@ def load_dem(
                   maps [n, rows, cols] that are cut one by one) and `cell_size`
     stride:       metres between the origins of neighbouring windows, rounded to whole cells
     cell_size:    metres, for files that do not say
-    nodata:       a height that marks unknown ground, if the file does not declare it
+    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a 16-bit PNG needs it
+    nodata:       a value that marks unknown ground, if the file does not declare it
     fill_holes:   interpolate holes whose every node lies within 0.125 m of known ground
     allow_coarse: take cells larger than 0.125 m
-    Raises InputError when the file is missing, is no elevation map, is in degrees, has no, a non-square or too large a
-    cell size, infinite or absurd heights or none at all, or is smaller than one window.
+    Raises InputError when the file is missing, is no elevation map, is in degrees or feet, has no, a non-square or too
+    large a cell size or not the given one, infinite or absurd heights or none at all, or is smaller than one window.
     """
     path = Path(path)
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
-    if cell_size is not None:
-        require_number("cell_size", cell_size, 0, 1000, "metres, above 0 and at most 1000")
+    require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
+    for name, value in (("cell_size", cell_size), ("height_scale", height_scale)):
+        if value is not None:
+            require_number(name, value, 0, 1000, "metres, above 0 and at most 1000")
     try:
-        rasters = [_checked(raster, nodata, allow_coarse) for raster in _read(path, cell_size)]
-        offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round())
+        rasters = [_checked(raster, grid, allow_coarse) for raster in _read(path, cell_size, height_scale, nodata)]
+        offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round()) + 0.0
         parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
+        checksum = hashlib.sha256(path.read_bytes()).hexdigest()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
     heights, origins, filled, unknown = zip(*parts, strict=True)
     return Windows(
         heights=np.concatenate(heights),
@@ -109,7 +119,7 @@ def load_dem(
         filled=float(np.mean(filled)),
         unknown=float(np.mean(unknown)),
         path=str(path),
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=checksum,
     )
 
 
@@ -117,58 +127,86 @@ def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_hole
     """(heights, origins, share filled, share unknown) of one raster."""
     raster, filled = _filled(raster) if fill_holes else (raster, 0.0)
     raster = resample(raster, grid.spacing)
-    corners = _corners(raster, stride, grid)
-    cut = [raster.heights[row : row + grid.nodes, col : col + grid.nodes] - offset for row, col in corners]
-    origins = np.array(raster.origin) + grid.spacing * np.array(corners)[:, ::-1]
-    return np.stack(cut).astype(np.float32), origins, filled, np.isnan(raster.heights).mean()
+    heights = (raster.heights - offset).astype(np.float32)
+    step = round(stride / grid.spacing)
+    rows, cols = (range(0, edge - grid.cells, step) for edge in heights.shape)
+    corners = np.array([(row, col) for row in rows for col in cols])
+    cut = np.stack([heights[row : row + grid.nodes, col : col + grid.nodes] for row, col in corners])
+    return cut, np.array(raster.origin) + grid.spacing * corners[:, ::-1], filled, np.isnan(heights).mean()
 
 
-def _read(path: Path, cell_size: float | None) -> list[Raster]:
+def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
+    if path.is_dir():
+        raise InputError("is a folder; allowed: a file")
     if not path.is_file():
         raise InputError("no such file")
-    if path.suffix in (".npy", ".npz"):
-        return _read_numpy(path, cell_size)
-    return [_read_raster(path, cell_size)]
+    if path.suffix.lower() in (".npy", ".npz"):
+        return _read_numpy(path, cell_size, scale, nodata)
+    return [_read_raster(path, cell_size, scale, nodata)]
 
 
-def _read_numpy(path: Path, cell_size: float | None) -> list[Raster]:
+def _read_numpy(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
     try:
         with path.open("rb") as file:
             loaded = np.load(file, allow_pickle=False)
-            entries = {"heights": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        reason = str(error).splitlines() or ["it is cut short"]
-        raise InputError(f"cannot be read as {path.suffix}: {reason[0]}") from None
+            wanted = ("heights", "cell_size", "origin", "crs", "height_offset")
+            one = isinstance(loaded, np.ndarray)
+            entries = {"heights": loaded} if one else {name: loaded[name] for name in wanted if name in loaded}
+            names = [] if one else list(loaded)
+    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
+        reason = "it is no such file, or cut short" if "pickled" in str(error) else str(error) or "it is cut short"
+        raise InputError(f"cannot be read as {path.suffix}: {reason.splitlines()[0]}") from None
     if "heights" not in entries:
-        raise InputError(f"no array `heights`; it holds: {', '.join(entries) or 'nothing'}")
+        raise InputError(f"no array `heights`; it holds: {', '.join(names) or 'nothing'}")
     heights = entries["heights"]
     if heights.ndim not in (2, 3) or not heights.size or not _is_real(heights):
         raise InputError(
             f"heights: {heights.dtype} {list(heights.shape)}: must be numbers [rows, cols] or [n, rows, cols]"
         )
-    if cell_size is None:
-        if "cell_size" not in entries:
-            raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
-        cell_size = _number(entries["cell_size"], "cell_size")
-    require_number("cell_size", cell_size, 0, 1000, "metres, above 0 and at most 1000")
-    origin = np.asarray(entries.get("origin", (0.0, 0.0))).reshape(-1)
-    pair = origin.shape == (2,) and _is_real(origin) and bool(np.isfinite(origin).all())
-    require(pair, "origin", origin.tolist(), "x, y of the south-west value")
-    crs = str(entries["crs"]) if "crs" in entries else None
-    maps = heights.astype(np.float64).reshape(-1, *heights.shape[-2:])
-    return [Raster(one, float(cell_size), (float(origin[0]), float(origin[1])), crs) for one in maps]
+    maps = _in_metres(heights.reshape(-1, *heights.shape[-2:]), scale or 1.0, 0.0, nodata)
+    each = len(maps)
+    if "cell_size" in entries:
+        cell_size = _agreed(_numbers(entries["cell_size"], "cell_size", "one number of metres", (1,))[0], cell_size)
+    elif cell_size is None:
+        raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
+    origins = _numbers(
+        entries.get("origin", np.zeros(2)), "origin", "x, y of the south-west value", (2,), (each, 2)
+    ).reshape(-1, 2)
+    offsets = _numbers(entries.get("height_offset", np.zeros(1)), "height_offset", "metres", (1,), (each,))
+    crs = str(np.ravel(entries["crs"])[0]) or None if np.size(entries.get("crs", ())) else None
+    described = zip(maps, np.broadcast_to(origins, (each, 2)), np.broadcast_to(offsets, each), strict=True)
+    return [Raster(one + offset, cell_size, (float(x), float(y)), crs) for one, (x, y), offset in described]
 
 
 def _is_real(array: np.ndarray) -> bool:
-    return np.issubdtype(array.dtype, np.integer) or np.issubdtype(array.dtype, np.floating)
+    return array.dtype.kind in "iuf"
 
 
-def _number(value: np.ndarray, name: str) -> float:
-    require(value.size == 1 and _is_real(value), name, value.tolist(), "one number of metres")
-    return float(value.reshape(()))
+def _numbers(value: np.ndarray, name: str, allowed: str, *shapes: tuple[int, ...]) -> np.ndarray:
+    """Finite numbers of one of the shapes; a single one counts as [1]."""
+    array = np.atleast_1d(value)
+    fits = array.shape in shapes and _is_real(array) and bool(np.isfinite(array).all())
+    require(fits, name, value.tolist(), allowed)
+    return array.astype(float)
 
 
-def _read_raster(path: Path, cell_size: float | None) -> Raster:
+def _in_metres(values: np.ndarray, scale: float, offset: float, nodata: float | None) -> np.ndarray:
+    """float64 heights; `nodata` is compared as the file's number type holds it."""
+    heights = values.astype(np.float64) * scale + offset
+    if nodata is not None:
+        heights[values == np.asarray(nodata).astype(values.dtype)] = np.nan
+    return heights
+
+
+def _agreed(of_file: float, given: float | None) -> float:
+    """The file's cell size, which the one given must not contradict."""
+    require_number("cell_size", of_file, 0, 1000, "metres, above 0 and at most 1000")
+    if given is not None:
+        require(abs(given - of_file) < 1e-4 * of_file, "cell_size", given, f"left out: the file says {of_file:g}")
+    return of_file
+
+
+def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> Raster:
     try:
         import rasterio
     except ImportError:
@@ -177,44 +215,61 @@ def _read_raster(path: Path, cell_size: float | None) -> Raster:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
             with rasterio.open(path) as file:
-                heights, transform, crs, bands = file.read(1, masked=True), file.transform, file.crs, file.count
+                require(file.count == 1, "bands", file.count, "1: an elevation map, not a picture")
+                values, transform, crs = file.read(1, masked=True), file.transform, file.crs
+                scales, offsets, driver = file.scales, file.offsets, file.driver
     except rasterio.errors.RasterioError as error:
-        raise InputError(f"not a raster that can be read: {str(error).splitlines()[0]}") from None
-    require(bands == 1, "bands", bands, "1: an elevation map, not a picture")
-    if np.iscomplexobj(heights):
-        raise InputError(f"heights: {heights.dtype}: must be numbers")
-    if crs is not None and crs.is_geographic:
-        raise InputError(f"crs = {crs.to_string()}: is in degrees; reproject it to metres (a UTM zone, say) first")
+        reason = str(error.__cause__ or error).splitlines()[0]
+        raise InputError(f"not a raster that can be read: {reason}") from None
+    if not _is_real(values):
+        raise InputError(f"heights: {values.dtype}: must be numbers")
+    if driver in ("PNG", "JPEG", "GIF", "BMP", "WEBP") and scale is None:
+        raise InputError(f"height_scale is missing: a {driver} holds no metres; give it (--height-scale METRES)")
+    _check_metric(crs)
     if transform.is_identity:
         if cell_size is None:
             raise InputError("cell_size is missing: the file is not georeferenced; give it (--cell-size METRES)")
+        west, south = 0.0, 0.0
     elif transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
         raise InputError(f"transform = {tuple(transform)[:6]}: must run east and south without rotation")
     elif abs(transform.a + transform.e) > 1e-4 * transform.a:
         raise InputError(f"cell_size = {transform.a:g} x {-transform.e:g}: must be square")
     else:
-        cell_size = transform.a
-    west, south = (0.0, 0.0) if transform.is_identity else rasterio.transform.xy(transform, len(heights) - 1, 0)
-    known = np.ma.filled(heights.astype(np.float64), np.nan)
-    return Raster(known[::-1], float(cell_size), (float(west), float(south)), crs.to_string() if crs else None)
+        cell_size = _agreed(transform.a, cell_size)
+        west, south = rasterio.transform.xy(transform, len(values) - 1, 0)
+    heights = _in_metres(values.data, scales[0] if scale is None else scale, offsets[0], nodata)
+    heights[np.ma.getmaskarray(values)] = np.nan
+    return Raster(heights[::-1], float(cell_size), (float(west), float(south)), crs.to_string() if crs else None)
 
 
-def _checked(raster: Raster, nodata: float | None, allow_coarse: bool) -> Raster:
-    heights = np.where(raster.heights == nodata, np.nan, raster.heights) if nodata is not None else raster.heights
-    known = heights[~np.isnan(heights)]
+def _check_metric(crs) -> None:
+    """Refuses degrees and feet; no system, or a local one that names no unit, is taken as metres."""
+    if crs is None:
+        return
+    name = crs.to_string().partition("[")[2].partition(",")[0] or crs.to_string()
+    if crs.is_geographic:
+        raise InputError(f"crs = {name}: is in degrees; reproject it to metres (a UTM zone, say) first")
+    unit, metres = crs.units_factor
+    if unit.lower() != "unknown" and abs(metres - 1) > 1e-9:
+        raise InputError(f"crs = {name}: is in units of {metres:g} m ({unit}); reproject it to metres first")
+
+
+def _checked(raster: Raster, grid: Grid, allow_coarse: bool) -> Raster:
+    known = raster.heights[~np.isnan(raster.heights)]
     if not known.size:
         raise InputError("heights: all unknown (NaN or nodata): must hold some known ground")
     for bad in (known.min(), known.max()):
-        if not LOWEST <= bad <= HIGHEST or bad in (-9999, -99999, -32768, 9999):
-            raise InputError(
-                f"heights = {bad:g}: must lie between {LOWEST:g} and {HIGHEST:g} m; "
-                "if it marks unknown ground, say so (--nodata VALUE)"
-            )
+        hint = "if it marks unknown ground, say so (--nodata=VALUE)"
+        if not LOWEST <= bad <= HIGHEST:
+            raise InputError(f"heights = {bad:g}: must lie between {LOWEST:g} and {HIGHEST:g} m; {hint}")
+        if bad in MARKERS:
+            raise InputError(f"heights = {bad:g}: is a usual mark of unknown ground, not declared as such; {hint}")
     if raster.cell_size > COARSEST + 1e-9 and not allow_coarse:
-        raise InputError(
-            f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it anyway)"
-        )
-    return Raster(heights, raster.cell_size, raster.origin, raster.crs)
+        raise InputError(f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it)")
+    north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
+    if min(north, east) < grid.size - 1e-6:
+        raise InputError(f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m")
+    return raster
 
 
 def _filled(raster: Raster) -> tuple[Raster, float]:
@@ -284,14 +339,4 @@ def resample(raster: Raster, spacing: float) -> Raster:
     at = np.meshgrid(rows, cols, indexing="ij")
     values = ndimage.map_coordinates(heights, at, order=1, mode="nearest")
     missing = ndimage.map_coordinates(unknown.astype(float), at, order=1, mode="nearest") > 1e-6
-    return Raster(np.where(missing, np.nan, values + level), raster.cell_size, raster.origin, raster.crs)
-
-
-def _corners(raster: Raster, stride: float, grid: Grid) -> list[tuple[int, int]]:
-    """Rows and columns of the south-west nodes of all full windows."""
-    rows, cols = raster.heights.shape
-    if min(rows, cols) < grid.nodes:
-        north, east = (rows - 1) * grid.spacing, (cols - 1) * grid.spacing
-        raise InputError(f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m")
-    step = max(1, round(stride / grid.spacing))
-    return [(row, col) for row in range(0, rows - grid.cells, step) for col in range(0, cols - grid.cells, step)]
+    return Raster(np.where(missing, np.nan, values + level), spacing, raster.origin, raster.crs)

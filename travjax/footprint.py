@@ -89,6 +89,11 @@ class NodeTable:
     source: np.ndarray
     layout: Layout
 
+    def __post_init__(self):
+        for array in vars(self).values():
+            if isinstance(array, np.ndarray):
+                array.setflags(write=False)
+
 
 @lru_cache(maxsize=8)
 def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
@@ -103,7 +108,7 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     turn, first = _first_arcs(actions, views)
     poses = _poses(actions, turn, first, np.arange(len(actions.radii)))
     flat = poses.reshape(-1, 3)
-    row, start, count = _chassis_rows(flat, robot, grid)
+    row, start, count = _chassis_rows(flat, robot, grid, actions.arc_lengths)
     centre = np.floor(flat[:, 1::-1] / grid.spacing + grid.cells / 2 + 0.5).astype(np.int32)
     chassis = np.stack([row - centre[:, :1], start - centre[:, 1:], count], axis=1).astype(np.int16)
     by_arc = lambda array: np.ascontiguousarray(array).reshape(*poses.shape[:2], *array.shape[1:])
@@ -171,7 +176,7 @@ def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.nd
         sin, cos, aside = np.sin(heading), np.cos(heading), -right if view.mirrored else right
         col = _nearest(x + cos * aside - sin * forward, grid)
         row = _nearest(y + sin * aside + cos * forward, grid)
-        _check_inside(row, col, grid)
+        _check_inside(row, col, grid, actions.arc_lengths)
         nodes.append(row * grid.nodes + col)
     return np.stack(nodes, axis=-1).astype(np.int32)
 
@@ -180,7 +185,9 @@ def _nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
     return np.floor(coordinate / grid.spacing + grid.cells / 2 + 0.5 + TIE).astype(int)
 
 
-def _chassis_rows(poses: np.ndarray, robot: Robot, grid: Grid) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _chassis_rows(
+    poses: np.ndarray, robot: Robot, grid: Grid, lengths: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The chassis nodes of each pose, row by row: row [P, rows], first column and number of columns [P, rows]."""
     width, length = robot.chassis_width / 2 + TIE, robot.chassis_length / 2 + TIE
     reach = math.ceil(math.hypot(width, length) / grid.spacing)
@@ -200,7 +207,7 @@ def _chassis_rows(poses: np.ndarray, robot: Robot, grid: Grid) -> tuple[np.ndarr
             f"spacing = {grid.spacing:g}: too coarse for {robot.name}, no node under its chassis at "
             f"{bare.sum()} poses; allowed: up to {min(robot.chassis_width, robot.chassis_length) / math.sqrt(2):.3g} m"
         )
-    _check_inside(row[count > 0], np.concatenate([start[count > 0], stop[count > 0]]), grid)
+    _check_inside(row[count > 0], np.concatenate([start[count > 0], stop[count > 0]]), grid, lengths)
     return row, start, count
 
 
@@ -211,11 +218,11 @@ def _interval(factor: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np
     return np.minimum(a, b), np.maximum(a, b)
 
 
-def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid) -> None:
+def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid, lengths: tuple[float, float]) -> None:
     outside = max(-row.min(), -col.min(), row.max() - grid.cells, col.max() - grid.cells)
     if outside > 0:
         raise InputError(
-            f"actions: trajectories leave the {grid.size:g} m map by {outside * grid.spacing:g} m; "
+            f"arc_lengths = {lengths}: trajectories leave the {grid.size:g} m map by {outside * grid.spacing:g} m; "
             "allowed: arcs short enough for wheels and chassis to stay on it"
         )
 

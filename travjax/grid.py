@@ -10,6 +10,9 @@ import numpy as np
 
 from travjax.config import require, require_number
 
+HIGHEST = 30_000.0
+"""Metres: what is higher, or as deep, is no height."""
+
 
 @dataclass(frozen=True)
 class Grid:

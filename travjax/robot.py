@@ -1,7 +1,7 @@
 """Four-wheel skid-steer robots (SPEC section 3); presets are the TOML files in robots/."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from travjax.config import InputError, load_toml, require, require_number
@@ -36,15 +36,13 @@ class Robot:
     overall_width: float
     ride_height: float
     max_step: float
-    max_tilt: float
+    max_tilt: float = field(metadata={"angle": True})
 
     def __post_init__(self):
         require(isinstance(self.name, str) and bool(self.name), "name", self.name, "a non-empty text")
-        for field in fields(self):
-            if field.name not in ("name", "max_tilt"):
-                require_number(
-                    field.name, getattr(self, field.name), 0, 100, "a length in metres, above 0 and at most 100"
-                )
+        for one in fields(self):
+            if one.name not in ("name", "max_tilt"):
+                require_number(one.name, getattr(self, one.name), 0, 100, "a length in metres, above 0 and at most 100")
         require_number("max_tilt", self.max_tilt, 0, math.pi / 2, "an angle above 0 and at most 90 degrees (pi/2 rad)")
 
     @staticmethod

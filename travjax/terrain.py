@@ -165,12 +165,12 @@ def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int
 @jax.jit
 def _sample(style, seed):
     def sample_one(style, seed):
-        key = jax.random.fold_in(jax.random.key(seed), style)
+        key = jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), style)
         for_half, for_values, for_noise = jax.random.split(key, 3)
         half = jax.random.bernoulli(for_half).astype(jnp.int32)
         low, high = jnp.asarray(_LIMITS)[style, half].T
-        values = low + (high - low) * jax.random.uniform(for_values, (len(FIELDS),))
-        return values, jax.random.randint(for_noise, (), 0, SEEDS)
+        values = low + (high - low) * jax.random.uniform(for_values, (len(FIELDS),), jnp.float32)
+        return values, jax.random.randint(for_noise, (), 0, SEEDS, jnp.int32)
 
     return jax.vmap(sample_one)(style, seed)
 
@@ -178,7 +178,7 @@ def _sample(style, seed):
 def elevation(params: TerrainParams, noise_seed, *, grid: Grid = Grid()) -> Float[Array, "*n rows cols"]:
     """Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
 
-    noise_seed: an integer in [0, 10000), or [n] of them
+    noise_seed: an integer in [0, 10000), or [n] of them; these and the parameters are looked at, so not under `jit`
     Raises InputError when the noise seed, or a parameter that shapes the noise, lies outside what is allowed.
     """
     seeds = np.asarray(noise_seed)

@@ -21,7 +21,7 @@ from travjax.actions import ActionSpace
 from travjax.batching import in_batches
 from travjax.config import InputError
 from travjax.footprint import RUN, Layout, View, chassis_places, node_table
-from travjax.grid import Grid
+from travjax.grid import HIGHEST, Grid
 from travjax.robot import Robot
 
 EVENTS = ("step", "obstacle", "tilt")
@@ -34,9 +34,6 @@ CHUNK = 200_000
 
 PLACES = 8
 """Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
-
-HIGHEST = 30_000.0
-"""Metres: larger heights are none."""
 
 UNKNOWN = 1e30
 """Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
@@ -71,7 +68,7 @@ def default_robot() -> Robot:
 
 def simulate(
     heights: Float[Array, "*n rows cols"],
-    robot: Robot | None = None,
+    robot: Robot | str | None = None,
     actions: ActionSpace | None = None,
     *,
     grid: Grid = Grid(),
@@ -80,12 +77,13 @@ def simulate(
 
     heights: [n, rows, cols] or [rows, cols] metres, NaN unknown; laid out as in grid.py. float64 NumPy heights are
              taken relative to the map's centre before they become float32, so a site at 2000 m loses nothing
-    robot, actions: Seekur Jr and the paper's action space unless given
+    robot:   a Robot, or the name or file of one; the Seekur Jr unless given
+    actions: the paper's action space unless given
     Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
-    Raises InputError when heights have another shape than the grid or are not numbers, and when a trajectory leaves the
-    map or turns inside the robot.
+    Raises InputError when heights have another shape than the grid or are not numbers, when NumPy heights are infinite
+    or beyond 30 km, and when a trajectory leaves the map or turns inside the robot.
     """
-    robot, actions = robot or default_robot(), actions or ActionSpace()
+    robot, actions = Robot.load(robot) if robot else default_robot(), actions or ActionSpace()
     maps = as_maps(heights, grid)
     layout = node_table(robot, actions, grid).layout
 
@@ -97,14 +95,15 @@ def simulate(
     return jax.tree.map(lambda margin: margin[0], margins) if np.ndim(heights) == 2 else margins
 
 
-def failures(margins: Margins, robot: Robot | None = None) -> Bool[Array, "*n t 3"]:
+def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
     """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
-    return margins.events() > jnp.asarray((robot or default_robot()).limits)
+    limits = (Robot.load(robot) if robot else default_robot()).limits
+    return margins.events() > jnp.asarray(limits, jnp.float32)
 
 
 def label(
     heights: Float[Array, "*n rows cols"],
-    robot: Robot | None = None,
+    robot: Robot | str | None = None,
     actions: ActionSpace | None = None,
     *,
     grid: Grid = Grid(),
@@ -132,8 +131,11 @@ def unpacked(labels: UInt8[Array, "*n t"]) -> tuple[Bool[Array, "*n t 3"], Bool[
 def as_maps(heights, grid: Grid) -> Float[Array, "n rows cols"]:
     """Checked float32 maps with a leading axis; float64 NumPy heights relative to each map's centre.
 
-    Heights of a jax array are not looked at: that would wait for the device.
+    Masked nodes are unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or
+    absurd ones are unknown.
     """
+    if np.ma.isMaskedArray(heights):
+        heights = np.ma.filled(heights.astype(np.float64), np.nan)
     if not isinstance(heights, jax.Array):
         heights = np.asarray(heights)
     if heights.dtype == bool or not jnp.issubdtype(heights.dtype, jnp.number) or np.iscomplexobj(heights):
@@ -216,8 +218,8 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
 @partial(jax.jit, static_argnames="layout")
 def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -> Margins:
     grid = layout.grid
-    heights = maps - jnp.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
-    heights = jnp.where(jnp.isnan(heights), UNKNOWN, heights)
+    centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
+    heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN)
     # Without these barriers XLA computes both anew for every element that is gathered from them.
     by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)
     views = jax.lax.optimization_barrier(_view_lanes(by_node, layout.views, grid))
