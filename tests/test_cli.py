@@ -329,7 +329,18 @@ def test_windows_of_a_geotiff_are_those_of_load_dem_with_where_they_come_from(re
     assert arrays["group"].tolist() == ["site.tif"]
     assert arrays["crs"].tolist() == ["EPSG:32632"]
     assert arrays["height_offset"].tolist() == [windows.height_offset]
-    assert arrays["sha256"].tolist() == [hashlib.sha256(site.read_bytes()).hexdigest()]
+    (read,) = json.loads(str(arrays["config"]))["files"]
+    assert read["sha256"] == hashlib.sha256(site.read_bytes()).hexdigest()
+    assert read["path"] == str(site)
+    assert (read["stride"], read["cell_size"], read["fill_holes"]) == (8, CELL, True)
+
+
+def test_labels_can_be_labelled_again(real, tmp_path, few):
+    words = ("label", real.folder / "labels.npz", "--actions", few, "--no-figures")
+    again, arrays = succeeds(tmp_path / "out", *words).arrays(), real.arrays()
+    np.testing.assert_array_equal(again["origin"], arrays["origin"])
+    np.testing.assert_allclose(again["heights"], arrays["heights"], rtol=0, atol=1e-5)
+    assert again["crs"].tolist() == arrays["crs"].tolist()
 
 
 def test_labels_of_a_geotiff_are_those_of_its_heights_and_unknown_ground_fails_nowhere(real):

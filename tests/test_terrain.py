@@ -1,5 +1,7 @@
 """Terrain against Algorithm 1 in float64 on the `opensimplex` package, and parameters against the table of styles."""
 
+import subprocess
+import sys
 from dataclasses import fields, replace
 
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from opensimplex import OpenSimplex
 from travjax.config import InputError
 from travjax.grid import Grid
 from travjax.terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
+from travjax.traverse import simulate
 
 FIELDS = [field.name for field in fields(TerrainParams)]
 
@@ -380,3 +383,17 @@ def test_a_parameter_that_is_not_finite_is_refused(field, value):
 def test_arrays_of_two_axes_are_refused():
     with pytest.raises(InputError, match=r"^params = 'arrays of shape \(2, 3\)': must be numbers or \[n\] arrays$"):
         elevation(replace(PLAIN, height_obstacles=np.ones((2, 3))), 3)
+
+
+def test_the_maps_are_the_same_where_float64_is_enabled():
+    program = (
+        "import jax, numpy, travjax; jax.config.update('jax_enable_x64', True); "
+        "z = travjax.generate_terrain('rough', [3, 4]); m = travjax.simulate(z); "
+        "print(z.dtype, m.step.dtype, *(repr(float(v)) for v in (z[0, 5, 7], z[1, 100, 3], m.tilt[1, 17])))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    heights = generate_terrain("rough", [3, 4])
+    expected = heights[0, 5, 7], heights[1, 100, 3], simulate(heights).tilt[1, 17]
+    heights_type, margin_type, *values = done.stdout.split()
+    assert (heights_type, margin_type) == ("float32", "float32")
+    np.testing.assert_allclose([float(value) for value in values], np.array(expected), rtol=0, atol=1e-6)

@@ -41,7 +41,7 @@ class ActionSpace:
     def __post_init__(self):
         for name in ("arc_lengths", "radii"):
             if isinstance(getattr(self, name), list | np.ndarray):
-                object.__setattr__(self, name, tuple(float(value) for value in getattr(self, name)))
+                object.__setattr__(self, name, tuple(np.asarray(getattr(self, name), object).tolist()))
         whole = isinstance(self.turns, Integral) and not isinstance(self.turns, bool)
         require(whole and 1 <= self.turns <= 3600, "turns", self.turns, "a whole number from 1 to 3600")
         pair = isinstance(self.arc_lengths, tuple) and len(self.arc_lengths) == 2
@@ -60,7 +60,9 @@ class ActionSpace:
             )
         require(len(set(self.radii)) == len(self.radii), "radii", self.radii, "different from each other")
         require(len(self) <= 1_000_000, "turns x radii x radii", len(self), "at most 1000000 trajectories")
-        require_number("interval", self.interval, 0, min(self.arc_lengths), "metres, at most the length of an arc")
+        require_number(
+            "interval", self.interval, 0, min(self.arc_lengths), "a length in metres, at most an arc's length"
+        )
         shortest = max(self.arc_lengths) / 1000
         require(
             self.interval >= shortest, "interval", self.interval, f"at least a thousandth of an arc, {shortest:g} m"

@@ -35,7 +35,7 @@ def require_number(field: str, value: object, low: float, high: float, allowed: 
         number = float(value) if real else math.nan  # type: ignore[arg-type]
     except OverflowError:
         number = math.nan
-    require(low < number <= high, field, value, allowed)
+    require(math.isfinite(number) and low < number <= high, field, value, allowed)
 
 
 def load_toml(path: str | Path, kind: type[Config]) -> Config:
