@@ -27,6 +27,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	if [ -z "$$found" ]; then \
 	  echo "make: no Python 3.11, 3.12 or 3.13 with venv and ensurepip runs here; install one, or name it: make PYTHON=..." >&2; \
 	  exit 2; fi; \
+	echo "Setting up $(VENV) with $$found, about a minute ..."; \
 	rm -rf $(VENV) && $$found -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
 	@touch $@

@@ -363,8 +363,9 @@ def test_what_was_read_from_a_geotiff_is_printed(real, site):
     assert "crs EPSG:32632" in line
     assert f"{4 / (140 * 150):.3%} filled" in line
     assert f"{300 / (140 * 150):.1%} unknown" in line
+    assert "1 windows cover 79.1%" in line
     arrays = real.arrays()
-    assert shares_table(arrays["group"], arrays["failed"], arrays["known"]) in real.out
+    assert shares_table(arrays["group"], arrays["failed"], arrays["known"], as_in_paper=False) in real.out
 
 
 def test_figures_of_a_geotiff_are_written_and_printed(real):

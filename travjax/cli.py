@@ -24,7 +24,7 @@ from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import FIELDS, STYLES, elevation, sample_params
-from travjax.traverse import failures, simulate
+from travjax.traverse import default_robot, failures, simulate
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -193,18 +193,22 @@ def _label(arguments: argparse.Namespace) -> None:
         labelled.append(batch | arrays)
     maps = _joined(labelled)
 
-    table = report.shares_table(maps["group"], maps["failed"], maps["known"])
+    as_in_paper = not arguments.dem and robot == default_robot() and actions == ActionSpace()
+    table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
     labels = save_npz(out / "labels.npz", config=_config(robot, actions, grid, files), cell_size=grid.spacing, **maps)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(table + "\n")
     print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+    unknown = int((~maps["known"].any(axis=-1)).sum())
+    if unknown:
+        print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
     print(labels, out / "shares.txt", sep="\n")
     if arguments.no_figures:
         return
     from travjax import plots  # matplotlib takes 0.3 s to import
 
     chosen = _samples(maps)
-    titles = [f"{maps['group'][index]} {_where(maps, index)}" for index in chosen]
+    titles = [f"{maps['group'][index][:30]}, {_where(maps, index)}" for index in chosen]
     heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
     print(plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"))
     print(plots.save(plots.robot_figure(robot), out / "robot.png"))
@@ -297,12 +301,13 @@ def _dem_windows(
         windows = load_dem(path, grid=grid, **options)
         crs = (windows.crs or "none").partition(",")[0]
         print(
-            f"{path}: {len(windows.heights)} windows, cells of {windows.cell_size:g} m, crs {crs}, "
-            f"{windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
+            f"{path}: {len(windows.heights)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
+            f"crs {crs}, {windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
         )
         files.append((path.name if names.count(path.name) == 1 else str(path), windows))
         read = {
-            name: getattr(windows, name) for name in ("path", "sha256", "crs", "height_offset", "filled", "unknown")
+            name: getattr(windows, name)
+            for name in ("path", "sha256", "crs", "height_offset", "covered", "filled", "unknown")
         }
         notes.append(read | options | {"cell_size": windows.cell_size})
 
@@ -354,4 +359,4 @@ def _samples(maps: dict[str, np.ndarray], most: int = 5) -> np.ndarray:
 def _where(maps: dict[str, np.ndarray], index: int) -> str:
     if "seed" in maps:
         return f"seed {maps['seed'][index]}"
-    return "from ({:.1f}, {:.1f})".format(*maps["origin"][index])
+    return "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])

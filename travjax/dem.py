@@ -54,6 +54,7 @@ class Windows:
     cell_size:     metres between values in the file; the windows are at the grid's spacing
     crs:           coordinate system as the file names it, or None
     height_offset: metres, subtracted from the file's heights in float64
+    covered:       share of the file's area that lies in some window
     filled:        share of all nodes that was interpolated in small holes
     unknown:       share of all nodes that stays unknown
     path, sha256:  the file and its checksum
@@ -64,6 +65,7 @@ class Windows:
     cell_size: float
     crs: str | None
     height_offset: float
+    covered: float
     filled: float
     unknown: float
     path: str
@@ -109,13 +111,14 @@ def load_dem(
         raise InputError(f"{path}: {error}") from None
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    heights, origins, filled, unknown = zip(*parts, strict=True)
+    heights, origins, covered, filled, unknown = zip(*parts, strict=True)
     return Windows(
         heights=np.concatenate(heights),
         origins=np.concatenate(origins),
         cell_size=rasters[0].cell_size,
         crs=rasters[0].crs,
         height_offset=offset,
+        covered=float(np.mean(covered)),
         filled=float(np.mean(filled)),
         unknown=float(np.mean(unknown)),
         path=str(path),
@@ -124,7 +127,7 @@ def load_dem(
 
 
 def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_holes: bool):
-    """(heights, origins, share filled, share unknown) of one raster."""
+    """(heights, origins, share covered, share filled, share unknown) of one raster."""
     raster, filled = _filled(raster) if fill_holes else (raster, 0.0)
     raster = resample(raster, grid.spacing)
     heights = (raster.heights - offset).astype(np.float32)
@@ -132,7 +135,11 @@ def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_hole
     rows, cols = (range(0, edge - grid.cells, step) for edge in heights.shape)
     corners = np.array([(row, col) for row in rows for col in cols])
     cut = np.stack([heights[row : row + grid.nodes, col : col + grid.nodes] for row, col in corners])
-    return cut, np.array(raster.origin) + grid.spacing * corners[:, ::-1], filled, np.isnan(heights).mean()
+    inside = np.zeros((heights.shape[0] - 1, heights.shape[1] - 1), bool)
+    for row, col in corners:
+        inside[row : row + grid.cells, col : col + grid.cells] = True
+    origins = np.array(raster.origin) + grid.spacing * corners[:, ::-1]
+    return cut, origins, inside.mean(), filled, np.isnan(heights).mean()
 
 
 def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
@@ -210,7 +217,7 @@ def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodat
     try:
         import rasterio
     except ImportError:
-        raise InputError('reading it needs rasterio: pip install "travjax[geo]"; .npy and .npz need nothing') from None
+        raise InputError("reading it needs rasterio: pip install rasterio; .npy and .npz need nothing") from None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
@@ -268,7 +275,9 @@ def _checked(raster: Raster, grid: Grid, allow_coarse: bool) -> Raster:
         raise InputError(f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it)")
     north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
     if min(north, east) < grid.size - 1e-6:
-        raise InputError(f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m")
+        raise InputError(
+            f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m, node to node"
+        )
     return raster
 
 

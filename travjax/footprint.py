@@ -223,7 +223,7 @@ def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid, lengths: tuple[f
     if outside > 0:
         raise InputError(
             f"arc_lengths = {lengths}: trajectories leave the {grid.size:g} m map by {outside * grid.spacing:g} m; "
-            "allowed: arcs short enough for wheels and chassis to stay on it"
+            "allowed: arcs short enough for wheels and chassis to stay on it, or a larger map (--size)"
         )
 
 

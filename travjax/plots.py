@@ -70,8 +70,8 @@ def labelled_maps(
         low, high = np.nanpercentile(one, [0.5, 99.5]) if np.isfinite(one).any() else (0, 1)
         image = _draw_elevation(axes[row, 0], one, grid, low, max(high, low + 1e-3))
         _draw_robot(axes[row, 0], robot)
-        figure.colorbar(image, ax=axes[row, 0], shrink=0.85)
-        axes[row, 0].set_title(f"{titles[row]}: elevation [m]", fontsize=9)
+        figure.colorbar(image, ax=axes[row, 0], shrink=0.85, label="elevation [m]")
+        axes[row, 0].set_title(titles[row], fontsize=9)
         for event, name in enumerate(EVENTS):
             ax = axes[row, 1 + event]
             _draw_elevation(ax, one, grid, low, max(high, low + 1e-3), colour="gray", alpha=0.35)
@@ -152,7 +152,7 @@ def robot_figure(robot: Robot) -> Figure:
     _dimension(side, (1.15 * edge, 0), (1.15 * edge, robot.max_step), "largest step", (0, 5))
     _dimension(side, (-radius - axle, -0.5 * radius), (radius - axle, -0.5 * radius), "wheel diameter", (0, -5))
     side.set(title=f"side; largest tilt {np.degrees(robot.max_tilt):.1f} deg", xlabel="forward [m]", ylabel="up [m]")
-    reach = 0.75 * robot.overall_length
+    reach = 1.05 * max(robot.overall_length, robot.overall_width)
     plan.set(xlim=(-reach, reach), ylim=(-reach, reach))
     side.set(xlim=(-2.1 * edge, 2.1 * edge), ylim=(-1.6 * radius, 1.2 * edge))
     for ax in (plan, side):
