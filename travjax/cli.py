@@ -299,7 +299,8 @@ def _dem_windows(
     files, notes = [], []
     for path in arguments.dem:
         windows = load_dem(path, grid=grid, **options)
-        crs = (windows.crs or "none").partition(",")[0]
+        crs = windows.crs or "none"
+        crs = crs.split('"')[1] if '"' in crs else crs  # of a system without a code, the name
         print(
             f"{path}: {len(windows.heights)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
             f"crs {crs}, {windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"

@@ -217,6 +217,11 @@ def speed_figure(rows: list[dict]) -> Figure:
         if chosen:
             ax.loglog([row["maps"] for row in chosen], [row["ms_per_map"] for row in chosen], "o-", label=what)
     ax.set(xlabel="maps at once", ylabel="ms a map (median)")
+    ax.set_xticks(sorted({row["maps"] for row in rows}))
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter("")
+    ax.yaxis.set_minor_formatter("{x:g}")
     ax.grid(alpha=0.3, which="both")
     ax.legend()
     return figure
