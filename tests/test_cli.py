@@ -21,7 +21,7 @@ from affine import Affine
 from PIL import Image
 
 import travjax
-from travjax import cli
+from travjax import cli, labelling
 from travjax.actions import ActionSpace
 from travjax.grid import Grid
 from travjax.report import shares_table
@@ -426,7 +426,7 @@ def test_up_to_five_maps_are_shown_each_once_and_from_as_many_groups_as_can_be(g
         "failed": np.repeat((np.arange(100) < 100 * rates[:, None])[..., None], 3, axis=-1),
         "known": np.ones((groups * count, 100), bool),
     }
-    chosen = cli._samples(maps)
+    chosen = labelling.samples(maps)
     assert len(set(chosen.tolist())) == len(chosen)
     assert 1 <= len(chosen) <= 5
     assert len(set(maps["group"][chosen])) == min(groups, 5)

@@ -20,6 +20,7 @@ ORDER = [
     "traverse",
     "reference",
     "dem",
+    "labelling",
     "plots",
     "report",
     "bench",

@@ -16,15 +16,15 @@ from tqdm import tqdm
 import travjax
 from travjax import report
 from travjax.actions import ActionSpace
-from travjax.batching import BATCH
 from travjax.config import InputError, require
 from travjax.dem import load_dem
 from travjax.files import output_folder, save_npz, written_whole
 from travjax.footprint import node_table
 from travjax.grid import Grid
+from travjax.labelling import Batch, dem_batches, joined, labelled, samples, synthetic_batches, title
 from travjax.robot import Robot
-from travjax.terrain import FIELDS, STYLES, elevation, sample_params
-from travjax.traverse import default_robot, failures, simulate
+from travjax.terrain import STYLES
+from travjax.traverse import default_robot
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -156,8 +156,7 @@ def _terrain(arguments: argparse.Namespace) -> None:
     out = output_folder(arguments.out)
     names = [style for style in styles for _ in range(count)]
     seeds = list(range(seed, seed + count)) * len(styles)
-    batches = list(_progress(_synthetic(names, seeds, grid), len(names), "terrain"))
-    maps = _joined(batches)
+    maps = joined(list(_progress(synthetic_batches(names, seeds, grid), len(names), "terrain")))
     print(save_npz(out / "terrain.npz", cell_size=grid.spacing, **maps))
     for style in styles:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
@@ -183,15 +182,10 @@ def _label(arguments: argparse.Namespace) -> None:
     else:
         styles, total, seed = arguments.style or list(STYLES), _count(arguments), _seed(arguments)
         names = [styles[number % len(styles)] for number in range(total)]
-        source, files = _synthetic(names, list(range(seed, seed + total)), grid), []
+        source, files = synthetic_batches(names, list(range(seed, seed + total)), grid), []
     out = output_folder(arguments.out)
 
-    labelled = []
-    for batch in _progress(source, total, "labelling"):
-        margins = simulate(batch["heights"], robot, actions, grid=grid)
-        arrays = jax.tree.map(np.asarray, dataclasses.asdict(margins) | {"failed": failures(margins, robot)})
-        labelled.append(batch | arrays)
-    maps = _joined(labelled)
+    maps = joined(list(_progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling")))
 
     as_in_paper = not arguments.dem and robot == default_robot() and actions == ActionSpace()
     table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
@@ -207,8 +201,8 @@ def _label(arguments: argparse.Namespace) -> None:
         return
     from travjax import plots  # matplotlib takes 0.3 s to import
 
-    chosen = _samples(maps)
-    titles = [f"{maps['group'][index][:30]}, {_where(maps, index)}" for index in chosen]
+    chosen = samples(maps)
+    titles = [title(maps, index) for index in chosen]
     heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
     print(plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"))
     print(plots.save(plots.robot_figure(robot), out / "robot.png"))
@@ -269,23 +263,7 @@ def _seed(arguments: argparse.Namespace) -> int:
     return seed
 
 
-def _synthetic(styles: list[str], seeds: list[int], grid: Grid) -> Iterator[dict[str, Any]]:
-    """Batches of maps with all that is needed to make them again."""
-    for start in range(0, len(seeds), BATCH):
-        names, numbers = styles[start : start + BATCH], seeds[start : start + BATCH]
-        params, noise_seeds = sample_params(names, numbers)
-        yield {
-            "heights": np.asarray(elevation(params, noise_seeds, grid=grid)),
-            "group": np.array(names),
-            "seed": np.array(numbers),
-            "noise_seed": np.asarray(noise_seeds),
-            **{field: np.asarray(getattr(params, field)) for field in FIELDS},
-        }
-
-
-def _dem_windows(
-    arguments: argparse.Namespace, grid: Grid
-) -> tuple[int, Iterator[dict[str, Any]], list[dict[str, Any]]]:
+def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of windows of all files, batches of them with where they come from, and how each file was read."""
     options: dict[str, Any] = {
         "stride": 8.0 if arguments.stride is None else arguments.stride,
@@ -312,30 +290,14 @@ def _dem_windows(
         }
         notes.append(read | options | {"cell_size": windows.cell_size})
 
-    def batches():
-        for name, windows in files:
-            for start in range(0, len(windows.heights), BATCH):
-                heights = windows.heights[start : start + BATCH]
-                yield {
-                    "heights": heights,
-                    "group": np.full(len(heights), name),
-                    "origin": windows.origins[start : start + BATCH],
-                    "height_offset": np.full(len(heights), windows.height_offset),
-                    "crs": np.full(len(heights), windows.crs or ""),
-                }
-
-    return sum(len(windows.heights) for _, windows in files), batches(), notes
+    return sum(len(windows.heights) for _, windows in files), dem_batches(files), notes
 
 
-def _progress(batches: Iterator[dict[str, Any]], total: int, what: str) -> Iterator[dict[str, Any]]:
+def _progress(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]:
     with tqdm(desc=what, total=total, unit="map") as bar:
         for batch in batches:
             yield batch
             bar.update(len(batch["heights"]))
-
-
-def _joined(batches: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
 
 
 def _config(robot: Robot, actions: ActionSpace, grid: Grid, files: list[dict[str, Any]]) -> str:
@@ -343,21 +305,3 @@ def _config(robot: Robot, actions: ActionSpace, grid: Grid, files: list[dict[str
     parts = {name: dataclasses.asdict(part) for name, part in (("robot", robot), ("actions", actions), ("grid", grid))}
     parts["actions"]["radii"] = ["inf" if np.isinf(radius) else radius for radius in actions.radii]
     return json.dumps(parts | {"files": files, "travjax": travjax.__version__}, allow_nan=False)
-
-
-def _samples(maps: dict[str, np.ndarray], most: int = 5) -> np.ndarray:
-    """Maps to show, the groups in turn and spread over each, those first that fail neither nowhere nor everywhere."""
-    fails = (maps["failed"].any(axis=-1) & maps["known"]).mean(axis=-1)
-    dull = (fails < 0.05) | (fails > 0.6)
-    spread = np.arange(len(fails)) * 0.618034 % 1  # the smallest few of these lie far apart
-    groups: dict[str, list[int]] = {}
-    for index in np.lexsort((spread, dull)):
-        groups.setdefault(maps["group"][index], []).append(int(index))
-    in_turn = sorted((rank, index) for members in groups.values() for rank, index in enumerate(members))
-    return np.array([index for _, index in in_turn[:most]])
-
-
-def _where(maps: dict[str, np.ndarray], index: int) -> str:
-    if "seed" in maps:
-        return f"seed {maps['seed'][index]}"
-    return "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])

@@ -24,6 +24,8 @@ from travjax.footprint import RUN, Layout, View, chassis_places, node_table
 from travjax.grid import HIGHEST, Grid
 from travjax.robot import Robot
 
+Heights = Float[Array, "*n rows cols"] | Float[np.ndarray, "*n rows cols"]
+
 EVENTS = ("step", "obstacle", "tilt")
 
 FEW_MAPS = 2
@@ -67,7 +69,7 @@ def default_robot() -> Robot:
 
 
 def simulate(
-    heights: Float[Array, "*n rows cols"],
+    heights: Heights,
     robot: Robot | str | None = None,
     actions: ActionSpace | None = None,
     *,
@@ -102,7 +104,7 @@ def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, 
 
 
 def label(
-    heights: Float[Array, "*n rows cols"],
+    heights: Heights,
     robot: Robot | str | None = None,
     actions: ActionSpace | None = None,
     *,
@@ -128,7 +130,7 @@ def unpacked(labels: UInt8[Array, "*n t"]) -> tuple[Bool[Array, "*n t 3"], Bool[
     return bits[..., :3].astype(bool), bits[..., 3] == 0
 
 
-def as_maps(heights, grid: Grid) -> Float[Array, "n rows cols"]:
+def as_maps(heights: Heights, grid: Grid) -> Float[Array, "n rows cols"]:
     """Checked float32 maps with a leading axis; float64 NumPy heights relative to each map's centre.
 
     Masked nodes are unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or
