@@ -146,15 +146,15 @@ def robot_figure(robot: Robot) -> Figure:
         side.fill(y + radius * np.cos(turn), radius + radius * np.sin(turn), color="black", alpha=0.75)
     edge = 0.6 * robot.overall_length
     side.plot(
-        [-1.6 * edge, edge, edge, 1.6 * edge], [0, 0, robot.max_step, robot.max_step], color="saddlebrown", linewidth=2
+        [-2 * edge, edge, edge, 2 * edge], [0, 0, robot.max_step, robot.max_step], color="saddlebrown", linewidth=2
     )
-    _dimension(side, (-edge, 0), (-edge, robot.ride_height), "ride height", (0, 5))
-    _dimension(side, (1.15 * edge, 0), (1.15 * edge, robot.max_step), "largest step", (0, 5))
+    _dimension(side, (-1.4 * edge, 0), (-1.4 * edge, robot.ride_height), "ride height", (0, 5))
+    _dimension(side, (1.5 * edge, 0), (1.5 * edge, robot.max_step), "largest step", (0, 5))
     _dimension(side, (-radius - axle, -0.5 * radius), (radius - axle, -0.5 * radius), "wheel diameter", (0, -5))
     side.set(title=f"side; largest tilt {np.degrees(robot.max_tilt):.1f} deg", xlabel="forward [m]", ylabel="up [m]")
     reach = 1.05 * max(robot.overall_length, robot.overall_width)
     plan.set(xlim=(-reach, reach), ylim=(-reach, reach))
-    side.set(xlim=(-2.1 * edge, 2.1 * edge), ylim=(-1.6 * radius, 1.2 * edge))
+    side.set(xlim=(-2.2 * edge, 2.2 * edge), ylim=(-1.6 * radius, 1.2 * edge))
     for ax in (plan, side):
         ax.set_aspect("equal")
         ax.grid(alpha=0.3)
