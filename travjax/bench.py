@@ -20,7 +20,6 @@ import numpy as np
 from travjax import reference
 from travjax.actions import ActionSpace
 from travjax.config import InputError
-from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import STYLES, generate_terrain
@@ -50,8 +49,7 @@ def machine() -> str:
 
 
 def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    """Raises InputError when robot, actions and grid do not fit together for the one simulator or the other."""
-    node_table(robot, actions, grid)
+    """Raises InputError when the sequential simulator refuses robot, actions and grid; `node_table` does so earlier."""
     try:
         for trajectory in range(0, len(actions), len(actions.radii) ** 2):
             reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)

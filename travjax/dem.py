@@ -8,7 +8,7 @@ import hashlib
 import warnings
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +106,8 @@ def load_dem(
         rasters = [_checked(raster, grid, allow_coarse) for raster in _read(path, cell_size, height_scale, nodata)]
         offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round()) + 0.0
         parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
-        checksum = hashlib.sha256(path.read_bytes()).hexdigest()
+        with path.open("rb") as file:
+            checksum = hashlib.file_digest(file, "sha256").hexdigest()
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except OSError as error:
@@ -135,11 +136,10 @@ def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_hole
     rows, cols = (range(0, edge - grid.cells, step) for edge in heights.shape)
     corners = np.array([(row, col) for row in rows for col in cols])
     cut = np.stack([heights[row : row + grid.nodes, col : col + grid.nodes] for row, col in corners])
-    inside = np.zeros((heights.shape[0] - 1, heights.shape[1] - 1), bool)
-    for row, col in corners:
-        inside[row : row + grid.cells, col : col + grid.cells] = True
+    across = [(len(starts) - 1) * min(step, grid.cells) + grid.cells for starts in (rows, cols)]
+    covered = np.prod(across) / np.prod(np.array(heights.shape) - 1)
     origins = np.array(raster.origin) + grid.spacing * corners[:, ::-1]
-    return cut, origins, inside.mean(), filled, np.isnan(heights).mean()
+    return cut, origins, covered, filled, np.isnan(heights).mean()
 
 
 def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
@@ -283,9 +283,11 @@ def _checked(raster: Raster, grid: Grid, allow_coarse: bool) -> Raster:
 
 def _filled(raster: Raster) -> tuple[Raster, float]:
     """Fills the small holes; also the share of nodes filled."""
+    unknown = np.isnan(raster.heights)
+    if not unknown.any():
+        return raster, 0.0
     from scipy import ndimage  # takes 0.3 s to import
 
-    unknown = np.isnan(raster.heights)
     far = ndimage.distance_transform_edt(unknown, sampling=raster.cell_size) > FILL_DISTANCE + 1e-9
     hole, holes = ndimage.label(unknown, np.ones((3, 3)))
     deep = np.zeros(holes + 1, bool)
@@ -293,8 +295,7 @@ def _filled(raster: Raster) -> tuple[Raster, float]:
     small = unknown & ~deep[hole]
     if not small.any():
         return raster, 0.0
-    heights = _interpolated(raster.heights, small)
-    return Raster(heights, raster.cell_size, raster.origin, raster.crs), float(small.mean())
+    return replace(raster, heights=_interpolated(raster.heights, small)), float(small.mean())
 
 
 def _interpolated(heights: np.ndarray, holes: np.ndarray) -> np.ndarray:
@@ -332,11 +333,11 @@ def resample(raster: Raster, spacing: float) -> Raster:
 
     A node is unknown where a value that it is made from is.
     """
-    from scipy import ndimage  # takes 0.3 s to import
-
     ratio = spacing / raster.cell_size
     if abs(ratio - 1) < 1e-6:
         return raster
+    from scipy import ndimage  # takes 0.3 s to import
+
     unknown = np.isnan(raster.heights)
     level = np.nanmedian(raster.heights)
     heights, share = np.where(unknown, 0.0, raster.heights - level), (~unknown).astype(float)
@@ -348,4 +349,4 @@ def resample(raster: Raster, spacing: float) -> Raster:
     at = np.meshgrid(rows, cols, indexing="ij")
     values = ndimage.map_coordinates(heights, at, order=1, mode="nearest")
     missing = ndimage.map_coordinates(unknown.astype(float), at, order=1, mode="nearest") > 1e-6
-    return Raster(np.where(missing, np.nan, values + level), spacing, raster.origin, raster.crs)
+    return replace(raster, heights=np.where(missing, np.nan, values + level), cell_size=spacing)

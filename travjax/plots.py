@@ -37,12 +37,12 @@ def contact_sheet(heights: np.ndarray, titles: Sequence[str], heading: str, grid
     rows = -(-len(heights) // columns)
     figure = Figure(figsize=(2.1 * columns + 1.2, 2.25 * rows + 0.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).reshape(-1)
-    low, high = np.nanpercentile(heights, [0.5, 99.5])
+    low, high = _colour_range(heights)
     for ax in axes[len(heights) :]:
         ax.set_visible(False)
     images = []
     for ax, one, title in zip(axes, heights, titles, strict=False):
-        images.append(_draw_elevation(ax, one, grid, low, max(high, low + 1e-3)))
+        images.append(_draw_elevation(ax, one, grid, low, high))
         ax.set_title(title, fontsize=8)
         ax.tick_params(labelsize=7)
     figure.colorbar(images[0], ax=axes.tolist(), label="elevation [m]", shrink=0.8)
@@ -67,14 +67,14 @@ def labelled_maps(
     figure = Figure(figsize=(13, 3.2 * len(heights) + 0.7), layout="constrained")
     axes = figure.subplots(len(heights), 4, sharex=True, sharey=True, squeeze=False)
     for row, one in enumerate(heights):
-        low, high = np.nanpercentile(one, [0.5, 99.5]) if np.isfinite(one).any() else (0, 1)
-        image = _draw_elevation(axes[row, 0], one, grid, low, max(high, low + 1e-3))
+        low, high = _colour_range(one)
+        image = _draw_elevation(axes[row, 0], one, grid, low, high)
         _draw_robot(axes[row, 0], robot)
         figure.colorbar(image, ax=axes[row, 0], shrink=0.85, label="elevation [m]")
         axes[row, 0].set_title(titles[row], fontsize=9)
         for event, name in enumerate(EVENTS):
             ax = axes[row, 1 + event]
-            _draw_elevation(ax, one, grid, low, max(high, low + 1e-3), colour="gray", alpha=0.35)
+            _draw_elevation(ax, one, grid, low, high, colour="gray", alpha=0.35)
             _draw_paths(ax, paths, failed[row, :, event], known[row])
             share = failed[row, :, event][known[row]].mean() if known[row].any() else np.nan
             ax.set_title(
@@ -90,6 +90,12 @@ def labelled_maps(
 
 
 _KINDS = ((SAFE, "safe"), (FAILED, "failed"), (UNKNOWN, "unknown"))
+
+
+def _colour_range(heights: np.ndarray) -> tuple[float, float]:
+    """Lowest and highest height that gets a colour of its own; outliers share the ends."""
+    low, high = np.nanpercentile(heights, [0.5, 99.5]) if np.isfinite(heights).any() else (0.0, 1.0)
+    return low, max(high, low + 1e-3)
 
 
 def _draw_elevation(ax, heights, grid: Grid, low: float, high: float, colour: str = TERRAIN, alpha: float = 1.0):

@@ -52,10 +52,6 @@ def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:
 def _cell(value) -> str:
     if value is None:
         return ""
-    return (
-        f"{value:,.4g}"
-        if isinstance(value, float) and value < 1e4
-        else f"{value:,.0f}"
-        if isinstance(value, int | float)
-        else str(value)
-    )
+    if isinstance(value, float) and value < 1e4:
+        return f"{value:,.4g}"
+    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)

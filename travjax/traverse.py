@@ -68,6 +68,10 @@ def default_robot() -> Robot:
     return Robot.load("seekur_jr")
 
 
+def _chosen(robot: Robot | str | None) -> Robot:
+    return default_robot() if robot is None else Robot.load(robot)
+
+
 def simulate(
     heights: Heights,
     robot: Robot | str | None = None,
@@ -85,7 +89,7 @@ def simulate(
     Raises InputError when heights have another shape than the grid or are not numbers, when NumPy heights are infinite
     or beyond 30 km, and when a trajectory leaves the map or turns inside the robot.
     """
-    robot, actions = Robot.load(robot) if robot else default_robot(), actions or ActionSpace()
+    robot, actions = _chosen(robot), actions or ActionSpace()
     maps = as_maps(heights, grid)
     layout = node_table(robot, actions, grid).layout
 
@@ -99,8 +103,7 @@ def simulate(
 
 def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
     """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
-    limits = (Robot.load(robot) if robot else default_robot()).limits
-    return margins.events() > jnp.asarray(limits, jnp.float32)
+    return margins.events() > jnp.asarray(_chosen(robot).limits, jnp.float32)
 
 
 def label(
@@ -140,7 +143,7 @@ def as_maps(heights: Heights, grid: Grid) -> Float[Array, "n rows cols"]:
         heights = np.ma.filled(heights.astype(np.float64), np.nan)
     if not isinstance(heights, jax.Array):
         heights = np.asarray(heights)
-    if heights.dtype == bool or not jnp.issubdtype(heights.dtype, jnp.number) or np.iscomplexobj(heights):
+    if not jnp.issubdtype(heights.dtype, jnp.number) or np.iscomplexobj(heights):
         raise InputError(f"heights: dtype {heights.dtype}: must be numbers (metres)")
     if heights.ndim not in (2, 3) or heights.shape[-2:] != grid.shape:
         allowed = f"[{grid.nodes}, {grid.nodes}] or [n, {grid.nodes}, {grid.nodes}]"
@@ -150,14 +153,14 @@ def as_maps(heights: Heights, grid: Grid) -> Float[Array, "n rows cols"]:
     if heights.size == 0:
         raise InputError("heights: zero maps: must be at least one")
     maps = heights.reshape(-1, *grid.shape)
-    if isinstance(maps, np.ndarray) and not (np.isnan(maps) | (np.abs(maps) <= HIGHEST)).all():
-        bad = maps[~(np.isnan(maps) | (np.abs(maps) <= HIGHEST))][0]
-        raise InputError(
-            f"heights = {bad:g}: must be metres between {-HIGHEST:g} and {HIGHEST:g}, or NaN where unknown"
-        )
-    if isinstance(maps, np.ndarray) and maps.dtype != np.float32:
-        maps = maps.astype(np.float64)
-        maps = maps - np.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
+    if isinstance(maps, np.ndarray):
+        absurd = np.abs(maps) > HIGHEST
+        if absurd.any():
+            allowed = f"metres between {-HIGHEST:g} and {HIGHEST:g}, or NaN where unknown"
+            raise InputError(f"heights = {maps[absurd][0]:g}: must be {allowed}")
+        if maps.dtype != np.float32:
+            maps = maps.astype(np.float64)
+            maps = maps - np.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
     return jnp.asarray(maps, jnp.float32)
 
 
