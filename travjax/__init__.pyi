@@ -4,6 +4,7 @@ from .actions import ActionSpace
 from .config import InputError
 from .dem import load_dem
 from .grid import Grid
+from .inputs import render_inputs
 from .robot import Robot
 from .terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 from .traverse import EVENTS, Margins, failures, label, simulate
@@ -24,6 +25,7 @@ __all__ = [
     "generate_terrain",
     "label",
     "load_dem",
+    "render_inputs",
     "sample_params",
     "simulate",
 ]

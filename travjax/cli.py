@@ -18,7 +18,7 @@ from travjax import report
 from travjax.actions import ActionSpace
 from travjax.config import InputError, require
 from travjax.dem import load_dem
-from travjax.files import output_folder, save_npz, written_whole
+from travjax.files import cache_folder, output_folder, save_npz, written_whole
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.labelling import Batch, dem_batches, joined, labelled, samples, synthetic_batches, title
@@ -137,7 +137,7 @@ def _add_out(parser: argparse.ArgumentParser, folder: str) -> None:
 def _use_compilation_cache() -> None:
     """Compiled code is kept between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "travjax" / "jax"
+        cache = cache_folder() / "jax"
         try:
             output_folder(cache)
         except InputError:

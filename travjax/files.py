@@ -41,6 +41,11 @@ def output_folder(path: str | Path) -> Path:
     return folder
 
 
+def cache_folder() -> Path:
+    """Where the user's machine keeps what can be made again."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "travjax"
+
+
 def save_npz(path: Path, **arrays) -> Path:
     """Writes arrays to one .npz file, whole or not at all."""
     with written_whole(path) as temporary, temporary.open("wb") as file:

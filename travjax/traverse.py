@@ -68,7 +68,8 @@ def default_robot() -> Robot:
     return Robot.load("seekur_jr")
 
 
-def _chosen(robot: Robot | str | None) -> Robot:
+def chosen_robot(robot: Robot | str | None) -> Robot:
+    """The robot that an argument names: the default one for None, else as `Robot.load` takes it."""
     return default_robot() if robot is None else Robot.load(robot)
 
 
@@ -89,7 +90,7 @@ def simulate(
     Raises InputError when heights have another shape than the grid or are not numbers, when NumPy heights are infinite
     or beyond 30 km, and when a trajectory leaves the map or turns inside the robot.
     """
-    robot, actions = _chosen(robot), actions or ActionSpace()
+    robot, actions = chosen_robot(robot), actions or ActionSpace()
     maps = as_maps(heights, grid)
     layout = node_table(robot, actions, grid).layout
 
@@ -103,7 +104,7 @@ def simulate(
 
 def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
     """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
-    return margins.events() > jnp.asarray(_chosen(robot).limits, jnp.float32)
+    return margins.events() > jnp.asarray(chosen_robot(robot).limits, jnp.float32)
 
 
 def label(
