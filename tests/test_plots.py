@@ -155,7 +155,7 @@ def labelled(failed: np.ndarray, known: np.ndarray, heights: np.ndarray | None =
 
 def paths(ax) -> dict[str, int]:
     """How many trajectories an axes draws in each kind's colour; a kind that has none is left out."""
-    kinds = {plots.SAFE: "safe", plots.FAILED: "failed", plots.UNKNOWN: "unknown"}
+    kinds = {plots.SAFE: "safe", plots.DOUBTFUL: "doubtful", plots.FAILED: "failed", plots.UNKNOWN: "unknown"}
     drawn = {}
     for lines in ax.collections:
         if isinstance(lines, LineCollection) and lines.get_segments():
@@ -251,6 +251,77 @@ def test_all_of_the_papers_trajectories_are_drawn(tmp_path):
     assert colours(pixels(figure, tmp_path)) > 500
     assert sum(paths(event_axes(figure)[0]).values()) == 3042
     assert figure.get_suptitle() == "3042 trajectories of Seekur Jr"
+
+
+# ---- Predicted maps
+
+
+def predicted(probabilities: np.ndarray, failed: np.ndarray, known: np.ndarray) -> Figure:
+    """The figure of maps of random ground, on few actions."""
+    heights = np.random.default_rng(0).standard_normal((len(failed), *GRID.shape)).astype(np.float32)
+    names = [f"map {number}" for number in range(len(failed))]
+    return plots.predicted_maps(heights, probabilities, failed, known, names, SEEKUR_JR, FEW, GRID)
+
+
+def of_event(figure: Figure, event: str) -> tuple:
+    """The axes with the predictions of an event, and those with the truth, of all maps in turn."""
+    shown = [ax for ax in figure.axes if ax.get_title().startswith(f"{event}, ")]
+    return [ax for ax in shown if "predicted" in ax.get_title()], [ax for ax in shown if "true" in ax.get_title()]
+
+
+def test_predictions_have_three_colours_over_the_truth_with_two_and_unknown(tmp_path):
+    probabilities, failed, known = np.zeros((1, 36, 3)), np.zeros((1, 36, 3), bool), np.ones((1, 36), bool)
+    probabilities[0, :, 0] = np.repeat([0.0, 0.2499, 0.25, 0.4999, 0.5, 1.0], [10, 5, 4, 3, 2, 12])
+    probabilities[0, :, 1] = 0.3
+    probabilities[0, :, 2] = 0.9
+    failed[0, 30:, 0] = failed[0, :, 2] = True
+    known[0, :8] = False
+    failed[0, :8] = False
+    figure = predicted(probabilities, failed, known)
+    image = pixels(figure, tmp_path)
+    drawn = {event: [paths(ax) for (ax,) in of_event(figure, event)] for event in EVENTS}
+    assert drawn == {
+        "step": [{"safe": 15, "doubtful": 7, "failed": 14}, {"unknown": 8, "safe": 22, "failed": 6}],
+        "obstacle": [{"doubtful": 36}, {"unknown": 8, "safe": 28}],
+        "tilt": [{"failed": 36}, {"unknown": 8, "failed": 28}],
+    }
+    (above,), (below,) = of_event(figure, "step")
+    assert above.get_title() == "step, predicted: 50.0% of known fail"
+    assert below.get_title() == "step, true: 21.4% of known fail"
+    assert above.get_window_extent().y0 > below.get_window_extent().y1
+    for ax in (above, below):
+        assert count_of(within(ax, image), "failed") > 100
+        assert count_of(within(ax, image), "safe") > 100
+
+
+def test_the_trajectory_that_is_predicted_to_fail_turns_red():
+    probabilities = np.zeros((1, 36, 3))
+    probabilities[0, FEW.index(3, 2, 1), 1] = 0.8
+    (ax,), _ = of_event(predicted(probabilities, probabilities > 1, np.ones((1, 36), bool)), "obstacle")
+    red = ax.collections[-1]
+    assert to_hex(red.get_colors()[0]) == plots.FAILED
+    np.testing.assert_allclose(red.get_segments()[0], FEW.poses(FEW.index(3, 2, 1))[:, :2], rtol=0, atol=1e-12)
+
+
+def test_predicted_maps_stand_below_each_other_each_with_its_own_predictions(tmp_path):
+    probabilities = np.stack([np.full((36, 3), level) for level in (0.1, 0.3, 0.7)])
+    failed, known = np.zeros((3, 36, 3), bool), np.ones((3, 36), bool)
+    failed[1] = True
+    known[2] = False
+    figure = predicted(probabilities, failed, known)
+    pixels(figure, tmp_path)
+    for event in EVENTS:
+        above, below = of_event(figure, event)
+        assert [set(paths(ax)) for ax in above] == [{"safe"}, {"doubtful"}, {"failed"}]
+        assert [set(paths(ax)) for ax in below] == [{"safe"}, {"failed"}, {"unknown"}]
+        assert [ax.get_title() for ax in (above[2], below[2])] == [
+            f"{event}, predicted: all unknown",
+            f"{event}, true: all unknown",
+        ]
+    elevations = [ax for ax in figure.axes if ax.get_title().startswith("map ")]
+    assert [ax.get_title() for ax in elevations] == ["map 0", "map 1", "map 2"]
+    (legend,) = [ax.get_legend() for ax in figure.axes if ax.get_legend()]
+    assert len(legend.get_texts()) == 4
 
 
 # ---- Robot and action space

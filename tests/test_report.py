@@ -5,7 +5,16 @@ import re
 import numpy as np
 import pytest
 
-from travjax.report import PAPER_SHARES, rows_table, shares_table
+from travjax.metrics import PAPER_REAL, evaluate
+from travjax.report import (
+    PAPER_SHARES,
+    baselines_table,
+    groups_table,
+    metrics_table,
+    rows_table,
+    shares_table,
+    threshold_table,
+)
 
 STEP, OBSTACLE, TILT = range(3)
 HEADINGS = ["", "maps", "step", "obstacle", "tilt", "any failure", "maps with none", "known"]
@@ -122,3 +131,103 @@ def test_rows_have_the_headings_and_order_of_the_columns():
 )
 def test_a_number_has_four_digits_and_none_is_blank(value, text):
     assert cells(rows_table([{"a": "row", "b": value}], {"a": "", "b": "a heading"}))["row"] == [text]
+
+
+# ---- Evaluation
+
+
+def ten_samples() -> tuple[np.ndarray, np.ndarray]:
+    """Of ten samples, step: four fail, three found and one false alarm; obstacle: two fail, none found; tilt: none."""
+    probabilities, failed = np.full((10, 3), 0.1), np.zeros((10, 3), bool)
+    failed[:4, STEP] = failed[:2, OBSTACLE] = True
+    probabilities[1:4, STEP] = [0.9, 0.8, 0.7]
+    probabilities[9, STEP] = 0.75
+    probabilities[0, STEP] = 0.2
+    return probabilities, failed
+
+
+def lines(table: str) -> list[list[str]]:
+    """The rows of a table, cut into cells; notes below it are left out."""
+    shown = table.split("\n- ")[0].splitlines()
+    rule = next(number for number, line in enumerate(shown) if line.startswith("--"))
+    columns = [match.span() for match in re.finditer("-+", shown[rule])]
+    return [[line[start:end].strip() for start, end in columns] for line in shown[rule + 1 :]]
+
+
+def notes(table: str) -> list[str]:
+    return table.split("\n- ")[1:]
+
+
+def test_metrics_are_those_worked_out_by_hand():
+    table = metrics_table(evaluate(*ten_samples()), paper=None)
+    step, obstacle, tilt, overall = lines(table)
+    # Failures stand at ranks 1, 2, 4 and 5: (1 + 1 + 3/4 + 4/5) / 4. Bins from the lowest, samples times distance:
+    # (5 x 0.1 + 1 x 0.8 + 2 x |0.725 - 0.5| + 1 x 0.2 + 1 x 0.1) / 10.
+    assert step[:8] == ["step", "0.800", "0.750", "0.750", "0.750", "40.00%", "0.887", "0.205"]
+    assert step[8:] == ["5", "1", "1", "3"]
+    assert obstacle == ["obstacle", "0.800", "0.000", "-", "0.000", "20.00%", "0.200", "0.100", "8", "0", "2", "0"]
+    assert tilt == ["tilt", "1.000", "-", "-", "-", "0.00%", "-", "0.100", "10", "0", "0", "0"]
+    assert overall[1:6] == ["0.867", "0.500", "0.750", "0.600", "20.00%"]
+    assert overall[8:] == ["23", "1", "3", "3"]
+
+
+def test_dashes_are_explained_below():
+    assert notes(metrics_table(evaluate(*ten_samples()))) == [
+        "obstacle: no sample is predicted to fail, so precision is undefined",
+        "tilt: no sample fails, so the figures with a dash are undefined",
+    ]
+    probabilities, failed = ten_samples()
+    failed[0] = True
+    probabilities[0] = 0.6
+    assert notes(metrics_table(evaluate(probabilities, failed))) == []
+    real = notes(metrics_table(evaluate(probabilities, failed), PAPER_REAL))
+    assert real == ["tilt in the paper: no sample fails, so the figures with a dash are undefined"]
+
+
+def test_the_papers_figures_stand_below_each():
+    rows = lines(metrics_table(evaluate(*ten_samples())))
+    assert [row[0] for row in rows] == ["step", "paper", "obstacle", "paper", "tilt", "paper", "overall", "paper"]
+    counts = ["3,126,951", "113,457", "13,615", "201,689"]
+    assert rows[1][1:] == ["0.963", "0.937", "0.640", "0.760", "6.23%", "", "", *counts]
+    assert rows[7][1:5] == ["0.980", "0.944", "0.684", "0.793"]
+    real = lines(metrics_table(evaluate(*ten_samples()), PAPER_REAL))
+    assert real[7][1:5] == ["0.995", "0.561", "0.251", "0.347"]
+    assert real[5][1:5] == ["0.999", "-", "-", "-"]
+
+
+def test_thresholds_are_those_worked_out_by_hand():
+    table = threshold_table(evaluate(*ten_samples(), recalls=(0.5, 0.75)))
+    rows = {(row[0], row[1]): row[2:] for row in lines(table)}
+    assert rows["step", "0.500"] == ["0.8", "0.500", "1.000", "0.667", "20.00%", ""]
+    assert rows["step", "0.750"] == ["0.7", "0.750", "0.750", "0.750", "40.00%", ""]
+    assert rows["step", "0.937"] == ["0.2", "1.000", "0.800", "0.889", "50.00%", "0.640"]
+    assert rows["obstacle", "0.949"] == ["0.1", "1.000", "0.200", "0.333", "100.00%", "0.770"]
+    assert rows["tilt", "0.500"] == ["-", "-", "-", "-", "-", ""]
+    assert rows["tilt", "0.989"][-1] == "0.474"
+    assert rows["overall", "0.944"][-1] == "0.684"
+    assert notes(table) == ["tilt: no sample fails, so the figures with a dash are undefined"]
+
+
+def test_groups_are_those_worked_out_by_hand():
+    table = groups_table(evaluate(*ten_samples(), ["wavy"] * 5 + ["rough"] * 5))
+    wavy, rough, everything = lines(table)
+    assert wavy[:5] == ["wavy", "5", "80.00%", "40.00%", "0.00%"]
+    assert wavy[5:9] == ["0.857", "0.000", "-", "0.667"]
+    assert rough == ["rough", "5", "0.00%", "0.00%", "0.00%", *["-"] * 8]
+    assert everything[:2] == ["all", "10"]
+    assert everything[9:12] == ["0.887", "0.200", "-"]
+    assert notes(table) == [
+        "step: no sample fails in rough",
+        "obstacle: no sample fails in rough",
+        "tilt: no sample fails in wavy, rough, all",
+    ]
+
+
+def test_baselines_stand_with_their_average_precisions():
+    probabilities, failed = ten_samples()
+    predictors = {"network": probabilities, "constant": np.full((10, 3), 0.3)}
+    table = baselines_table({name: evaluate(one, failed).average_precision for name, one in predictors.items()})
+    network, constant = lines(table)
+    assert network[:4] == ["network", "0.887", "0.200", "-"]
+    assert constant == ["constant", "0.400", "0.200", "-", "0.200", "0.300"]
+    assert notes(table) == ["tilt: no sample fails, so average precision is undefined"]

@@ -20,7 +20,9 @@ from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.traverse import EVENTS
 
-SAFE, FAILED, UNKNOWN = "#2a9d3a", "#d62718", "#8a8a8a"
+SAFE, DOUBTFUL, FAILED, UNKNOWN = "#2a9d3a", "#f2c40f", "#d62718", "#8a8a8a"
+DOUBT, FAILURE = 0.25, 0.5
+"""Probabilities from which a trajectory is drawn as doubtful and as failing, as in the paper."""
 TERRAIN = "gist_earth"
 
 
@@ -75,11 +77,8 @@ def labelled_maps(
         for event, name in enumerate(EVENTS):
             ax = axes[row, 1 + event]
             _draw_elevation(ax, one, grid, low, high, colour="gray", alpha=0.35)
-            _draw_paths(ax, paths, failed[row, :, event], known[row])
-            share = failed[row, :, event][known[row]].mean() if known[row].any() else np.nan
-            ax.set_title(
-                f"{name}: {share:.1%} of known fail" if known[row].any() else f"{name}: all unknown", fontsize=9
-            )
+            _draw_paths(ax, paths, _by_label(failed[row, :, event], known[row]))
+            ax.set_title(_share_title(name, failed[row, :, event], known[row]), fontsize=9)
         axes[row, 0].set_ylabel("y, forward [m]")
     for ax in axes[-1]:
         ax.set_xlabel("x, right [m]")
@@ -87,6 +86,59 @@ def labelled_maps(
     figure.legend(handles=legend, loc="outside upper right", ncols=3, frameon=False)
     figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
     return figure
+
+
+def predicted_maps(
+    heights: np.ndarray,
+    probabilities: np.ndarray,
+    failed: np.ndarray,
+    known: np.ndarray,
+    titles: Sequence[str],
+    robot: Robot,
+    actions: ActionSpace,
+    grid: Grid,
+) -> Figure:
+    """For each map the elevation and, for each event, the action space as predicted and below it the truth.
+
+    heights: [n, rows, cols]; probabilities, failed: [n, t, 3]; known: [n, t]. The paper's qualitative figure.
+    """
+    paths = actions.poses(np.arange(len(actions)))[..., :2]
+    figure = Figure(figsize=(13, 6.3 * len(heights) + 0.5), layout="constrained")
+    axes = figure.subplots(2 * len(heights), 4, sharex=True, sharey=True, squeeze=False)
+    for one, (left, *above), (corner, *below) in zip(range(len(heights)), axes[::2], axes[1::2], strict=True):
+        image = _draw_elevation(left, heights[one], grid, *_colour_range(heights[one]))
+        _draw_robot(left, robot)
+        figure.colorbar(image, ax=left, shrink=0.85, label="elevation [m]")
+        left.set_title(titles[one], fontsize=9)
+        left.set_ylabel("y, forward [m]")
+        left.tick_params(labelbottom=True)
+        corner.axis("off")
+        for event, name in enumerate(EVENTS):
+            predicted, fails = probabilities[one, :, event], failed[one, :, event]
+            for ax, what, mask, by_colour in (
+                (above[event], "predicted", predicted >= FAILURE, _by_probability(predicted)),
+                (below[event], "true", fails, _by_label(fails, known[one])),
+            ):
+                _draw_elevation(ax, heights[one], grid, *_colour_range(heights[one]), colour="gray", alpha=0.35)
+                _draw_paths(ax, paths, by_colour)
+                ax.set_title(_share_title(f"{name}, {what}", mask, known[one]), fontsize=9)
+    for ax in axes[-1, 1:]:
+        ax.set_xlabel("x, right [m]")
+    axes[1, 0].legend(handles=[Line2D([], [], color=colour, label=text) for colour, text in _BANDS], loc="center")
+    figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
+    return figure
+
+
+_BANDS = (
+    (SAFE, f"predicted below {DOUBT:g}, or safe"),
+    (DOUBTFUL, f"predicted {DOUBT:g} to {FAILURE:g}"),
+    (FAILED, f"predicted {FAILURE:g} or more, or failed"),
+    (UNKNOWN, "unknown ground"),
+)
+
+
+def _share_title(name: str, fails: np.ndarray, known: np.ndarray) -> str:
+    return f"{name}: {fails[known].mean():.1%} of known fail" if known.any() else f"{name}: all unknown"
 
 
 _KINDS = ((SAFE, "safe"), (FAILED, "failed"), (UNKNOWN, "unknown"))
@@ -110,9 +162,18 @@ def _draw_elevation(ax, heights, grid: Grid, low: float, high: float, colour: st
     return image
 
 
-def _draw_paths(ax, paths: np.ndarray, failed: np.ndarray, known: np.ndarray) -> None:
-    """Trajectories, the failed ones on top."""
-    for mask, colour in ((~known, UNKNOWN), (known & ~failed, SAFE), (known & failed, FAILED)):
+def _by_label(failed: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
+    """Which trajectories have each colour, the last on top."""
+    return {UNKNOWN: ~known, SAFE: known & ~failed, FAILED: known & failed}
+
+
+def _by_probability(probability: np.ndarray) -> dict[str, np.ndarray]:
+    failing = probability >= FAILURE
+    return {SAFE: probability < DOUBT, DOUBTFUL: (probability >= DOUBT) & ~failing, FAILED: failing}
+
+
+def _draw_paths(ax, paths: np.ndarray, by_colour: dict[str, np.ndarray]) -> None:
+    for colour, mask in by_colour.items():
         ax.add_collection(LineCollection(paths[mask], colors=colour, linewidths=0.25, alpha=0.7))
 
 

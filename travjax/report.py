@@ -1,9 +1,13 @@
 """Printed tables."""
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from tabulate import tabulate
+
+from travjax.metrics import NAMES, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
+from travjax.traverse import EVENTS
 
 PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure": 0.096}
 """Shares of the paper's synthetic test trajectories that fail (SPEC section 10); its robot is not published in full."""
@@ -24,7 +28,7 @@ def shares_table(
     if as_in_paper:
         rows.append(["paper's test set", None, *(f"{share:.2%}" for share in PAPER_SHARES.values()), None, None])
     headers = ["", "maps", *PAPER_SHARES, "maps with none", "known"]
-    return tabulate(rows, headers, disable_numparse=True, stralign="right", colalign=("left",))
+    return _table(rows, headers)
 
 
 def _shares(name: str, failed: np.ndarray, known: np.ndarray) -> list:
@@ -46,7 +50,7 @@ def _shares(name: str, failed: np.ndarray, known: np.ndarray) -> list:
 def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:
     """A table of dicts; columns maps keys to headings. None is left blank, numbers have four significant digits."""
     cells = [[_cell(row[key]) for key in columns] for row in rows]
-    return tabulate(cells, list(columns.values()), disable_numparse=True, stralign="right", colalign=("left",))
+    return _table(cells, list(columns.values()))
 
 
 def _cell(value) -> str:
@@ -55,3 +59,97 @@ def _cell(value) -> str:
     if isinstance(value, float) and value < 1e4:
         return f"{value:,.4g}"
     return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
+    """Figures and counts of each event and overall, the paper's below each; a dash is explained below the table."""
+    rows, notes = [], []
+    for name, scores in evaluation.scores.items():
+        precision, error = scores.average_precision, evaluation.calibration[name].error
+        rows.append([name, *_figures(scores.confusion), _share(precision), _share(error), *_counts(scores.confusion)])
+        notes.append(_why_undefined(name, scores.confusion))
+        if paper:
+            rows.append(["  paper", *_figures(paper[name]), "", "", *_counts(paper[name])])
+            notes.append(_why_undefined(f"{name} in the paper", paper[name]))
+    headers = ["", "accuracy", "recall", "precision", "F1", "failures", "AP", "ECE", "TN", "FP", "FN", "TP"]
+    return _with_notes(_table(rows, headers), notes)
+
+
+def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
+    """The highest threshold that reaches each recall, what it costs, and the paper's precision at its own recall."""
+    rows, notes = [], []
+    for name, points in evaluation.points.items():
+        for point in points:
+            found = point.confusion
+            threshold, flagged = f"{point.threshold:.4g}", f"{(found.fp + found.tp) / found.samples:.2%}"
+            figures = [threshold, _share(found.recall), _share(found.precision), _share(found.f1), flagged]
+            beside = _share(paper[name].precision) if paper and _is_of(paper[name], point) else ""
+            rows.append([name, f"{point.wanted:.3f}", *(["-"] * 5 if math.isnan(point.threshold) else figures), beside])
+        notes.append(_why_undefined(name, points[0].confusion))
+    headers = ["", "wanted recall", "threshold", "recall", "precision", "F1", "predicted to fail", "paper's precision"]
+    return _with_notes(_table(rows, headers), notes)
+
+
+def groups_table(evaluation: Evaluation) -> str:
+    """For each group its samples and, of each event, the share that fails, F1 and average precision."""
+    rows = []
+    undefined: dict[str, list[str]] = {event: [] for event in EVENTS}
+    for group, scores in [*evaluation.groups.items(), ("all", evaluation.scores)]:
+        events = [scores[event] for event in EVENTS]
+        failures = [f"{one.confusion.failures:.2%}" for one in events]
+        f1 = [_share(one.confusion.f1) for one in (*events, scores["overall"])]
+        precisions = [_share(one.average_precision) for one in (*events, scores["overall"])]
+        for event, one in zip(EVENTS, events, strict=True):
+            undefined[event] += [] if one.confusion.failures else [group]
+        rows.append([group, f"{events[0].confusion.samples:,}", *failures, *f1, *precisions])
+    per_event = [
+        *(f"{event} fails" for event in EVENTS),
+        *(f"{what} {name}" for what in ("F1", "AP") for name in NAMES),
+    ]
+    headers = [title.replace(" ", "\n") for title in ("", "samples", *per_event)]
+    notes = [f"{event}: no sample fails in {', '.join(names)}" for event, names in undefined.items() if names]
+    return _with_notes(_table(rows, headers), notes)
+
+
+def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
+    """Average precision of named predictors by event, overall and their mean, from `Evaluation.average_precision`."""
+    columns = (*NAMES, "mean")
+    undefined = [name for name in columns if any(math.isnan(values[name]) for values in rows.values())]
+    cells = [[predictor, *(_share(values[name]) for name in columns)] for predictor, values in rows.items()]
+    notes = [f"{name}: no sample fails, so average precision is undefined" for name in undefined]
+    return _with_notes(_table(cells, ["average precision", *columns]), notes)
+
+
+def _figures(counts: Confusion) -> list[str]:
+    figures = (counts.accuracy, counts.recall, counts.precision, counts.f1)
+    return [*(_share(figure) for figure in figures), f"{counts.failures:.2%}"]
+
+
+def _counts(counts: Confusion) -> list[str]:
+    return [f"{count:,}" for count in (counts.tn, counts.fp, counts.fn, counts.tp)]
+
+
+def _share(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
+
+
+def _is_of(paper: Confusion, point: OperatingPoint) -> bool:
+    return abs(paper.recall - point.wanted) < 0.0005
+
+
+def _why_undefined(what: str, counts: Confusion) -> str:
+    """Why some figures of a confusion are a dash; nothing where none is."""
+    if not counts.fn + counts.tp:
+        return f"{what}: no sample fails, so the figures with a dash are undefined"
+    if not counts.fp + counts.tp:
+        return f"{what}: no sample is predicted to fail, so precision is undefined"
+    return ""
+
+
+def _table(rows: list[list[str]], headers: Sequence[str]) -> str:
+    return tabulate(rows, headers, disable_numparse=True, stralign="right", colalign=("left",))
+
+
+def _with_notes(table: str, notes: Iterable[str]) -> str:
+    """The table and below it what its dashes mean."""
+    return "\n".join([table, *(f"- {note}" for note in notes if note)])
