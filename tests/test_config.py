@@ -1,12 +1,13 @@
 """Configurations from TOML files, and the one line that says what is wrong with one."""
 
+import json
 import math
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 
-from travjax.config import InputError, load_toml, require, require_number
+from travjax.config import InputError, from_json, load_toml, require, require_number, to_json
 
 
 @dataclass(frozen=True)
@@ -145,3 +146,46 @@ def test_a_number_within_the_bounds_is_allowed(value):
 def test_what_is_no_finite_number_within_the_bounds_is_refused(value):
     with pytest.raises(InputError, match="^field = .*: must be above 0, at most 2$"):
         require_number("field", value, 0, 2, "above 0, at most 2")
+
+
+@dataclass(frozen=True)
+class Track(Ramp):
+    name: str = "inf"
+    laps: int = 1
+
+
+@pytest.mark.parametrize(
+    "config", [Track(2.5, 0.1, (math.inf, 1 / 3, -math.inf)), Track(1e-17, 0.5, ()), Track(1, 0, (1, 2), "a", 3)]
+)
+def test_a_configuration_comes_back_from_json_as_it_was(config):
+    text = json.dumps(to_json(config), allow_nan=False)
+    again = from_json(json.loads(text), Track)
+    assert again == config and repr(again) == repr(config) and hash(again) == hash(config)
+
+
+def test_an_infinite_number_is_text_in_json():
+    assert to_json(Ramp(1, 0, (math.inf, -math.inf, 2.0)))["marks"] == ["inf", "-inf", 2.0]
+
+
+def test_numpy_numbers_become_plain_ones_in_json():
+    table = to_json(Track(np.float64(0.1), 0.5, (np.float32(0.5), 1 / 3), laps=np.int64(3)))
+    assert json.loads(json.dumps(table)) == {
+        "length": 0.1,
+        "slope": 0.5,
+        "marks": [0.5, 1 / 3],
+        "name": "inf",
+        "laps": 3,
+    }
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ({"length": 1}, "missing slope"),
+        ({"length": 1, "slope": 0, "width": 2}, "unknown key 'width'; allowed: length, slope, marks"),
+        ({"length": -1, "slope": 0}, "length = -1: must be a length in metres, above 0 and at most 100"),
+    ],
+)
+def test_json_that_does_not_fit_is_refused(table, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        from_json(table, Ramp)

@@ -9,7 +9,7 @@ import math
 import textwrap
 import tomllib
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -56,6 +56,25 @@ def load_toml(path: str | Path, kind: type[Config]) -> Config:
         return kind(**_fields_from(table, kind))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def to_json(config: object) -> dict[str, Any]:
+    """A configuration dataclass as JSON can hold it: tuples are lists, and an infinite number in one is "inf"."""
+
+    def plain(value):
+        if isinstance(value, tuple):
+            items = [plain(item) for item in value]
+            return [str(item) if item in (math.inf, -math.inf) else item for item in items]
+        return value.item() if isinstance(value, np.generic) else value
+
+    return {field.name: plain(getattr(config, field.name)) for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+
+
+def from_json(table: dict[str, Any], kind: type[Config]) -> Config:
+    """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
+    infinite = {"inf": math.inf, "-inf": -math.inf}
+    lists = {key: [infinite.get(item, item) for item in value] for key, value in table.items() if type(value) is list}
+    return kind(**_fields_from(table | lists, kind))
 
 
 def _fields_from(table: dict, kind: type) -> dict:

@@ -1,0 +1,333 @@
+"""The data set: maps, the labels of all their trajectories, and which split each map belongs to (SPEC section 7).
+
+`generate` makes it from one seed, all in memory; `save` and `load` keep it as one folder of .npy files with a
+`dataset.json` that holds the configurations and each file's size and SHA-256.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import os
+import shutil
+import textwrap
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from travjax.actions import ActionSpace
+from travjax.config import InputError, from_json, require, require_number, to_json
+from travjax.footprint import node_table
+from travjax.grid import Grid
+from travjax.robot import Robot
+from travjax.sampling import random_keys
+from travjax.terrain import STYLES, generate_terrain
+from travjax.traverse import failures, packed, simulate
+
+SPLITS = ("train", "validation", "test")
+
+FORMAT, FORMAT_VERSION = "travjax data set", 1
+
+ARRAYS = ("heights", "labels", "group", "seed", "split")
+"""Each is a file of its own, `heights.npy` and so on."""
+
+CHUNK = 256
+"""Maps made and labelled before they are copied into the arrays."""
+
+Progress = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What a synthetic data set is made from.
+
+    maps:             number of maps, the five styles in turn
+    seed:             gives the terrain seeds and the splits
+    validation, test: shares of the maps, the rest is for training
+    """
+
+    maps: int = 56_840
+    seed: int = 0
+    validation: float = 0.08
+    test: float = 0.02
+
+    def __post_init__(self):
+        whole = lambda value: isinstance(value, Integral) and not isinstance(value, bool)
+        require(whole(self.maps) and 1 <= self.maps <= 10**7, "maps", self.maps, "a whole number from 1 to 10000000")
+        require(whole(self.seed) and 0 <= self.seed < 2**63, "seed", self.seed, "a whole number from 0 to 2^63 - 1")
+        for name in ("validation", "test"):
+            require_number(name, getattr(self, name), -math.inf, 1, "a share from 0 to 1")
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a share from 0 to 1")
+        require(self.validation + self.test <= 1, "validation + test", self.validation + self.test, "at most 1")
+
+    def styles(self) -> np.ndarray:
+        """The style of each map: [n] texts."""
+        return np.resize(np.array(STYLES), self.maps)
+
+    def seeds(self) -> np.ndarray:
+        """The terrain seed of each map: [n] uint32, all different.
+
+        Data sets of another seed or size have other maps, so that no test map of one is a training map of another.
+        """
+        spare = 64 + self.maps // 16  # for the few that come twice
+        keys = random_keys(("terrain", (self.seed, self.maps)), np.arange(self.maps + spare)) >> np.uint64(32)
+        first = np.sort(np.unique(keys, return_index=True)[1])
+        return keys[first[: self.maps]].astype(np.uint32)
+
+    def split_sizes(self) -> tuple[int, int, int]:
+        """Maps of each of SPLITS: the shares rounded down, the rest for training.
+
+        The paper's 56,840 maps give 51157, 4547 and 1136, its own number of test maps. From three maps on
+        each split whose share is not 0 has one at least.
+        """
+        test, validation = (math.floor(share * self.maps + 1e-9) for share in (self.test, self.validation))
+        sizes = [self.maps - validation - test, validation, test]
+        shares = (1 - self.validation - self.test, self.validation, self.test)
+        for index, share in enumerate(shares):
+            if self.maps >= len(SPLITS) and share > 1e-9 and not sizes[index]:
+                sizes[sizes.index(max(sizes))] -= 1
+                sizes[index] = 1
+        return tuple(sizes)  # type: ignore[return-value]
+
+    def splits(self) -> np.ndarray:
+        """The split of each map: [n] uint8 index into SPLITS. Styles differ by one map at most in each split.
+
+        The maps of each style are shuffled among the places of that style, and each split takes a run of places.
+        """
+        keys = random_keys(("split", (self.seed, self.maps)), np.arange(self.maps))
+        order = np.arange(self.maps)
+        for style in range(len(STYLES)):
+            members = order[style :: len(STYLES)]
+            order[style :: len(STYLES)] = members[np.argsort(keys[members], kind="stable")]
+        split = np.empty(self.maps, np.uint8)
+        split[order] = np.repeat(np.arange(len(SPLITS), dtype=np.uint8), self.split_sizes())
+        return split
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Maps, labels and splits; arrays on the host, to be read only.
+
+    heights: [n, rows, cols] float32 metres, NaN unknown
+    labels:  [n, t] uint8, one byte a trajectory as traverse.py packs them
+    group:   [n] style or site name; a style if there is a `config`
+    seed:    [n] uint32 terrain seed; 0 for real maps
+    split:   [n] uint8 index into SPLITS
+    robot, actions, grid: what the labels hold for
+    config:  what the maps were made from; None for real maps
+
+    Raises InputError when the arrays do not fit together.
+    """
+
+    heights: np.ndarray
+    labels: np.ndarray
+    group: np.ndarray
+    seed: np.ndarray
+    split: np.ndarray
+    robot: Robot
+    actions: ActionSpace
+    grid: Grid
+    config: DatasetConfig | None
+
+    def __post_init__(self):
+        maps = self.config.maps if self.config else len(self.split)
+        expected = {
+            "heights": ((maps, *self.grid.shape), "f4"),
+            "labels": ((maps, len(self.actions)), "u1"),
+            "group": ((maps,), "U"),
+            "seed": ((maps,), "u4"),
+            "split": ((maps,), "u1"),
+        }
+        for name, (shape, kind) in expected.items():
+            array = getattr(self, name)
+            fits = array.shape == shape and kind in (array.dtype.kind, array.dtype.str[1:])
+            allowed = f"{list(shape)} of {'text' if kind == 'U' else np.dtype(kind)}"
+            require(fits, name, f"{list(array.shape)} of {array.dtype}", allowed)
+        wrong = self.split[self.split >= len(SPLITS)]
+        require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
+        unknown = self.group[~np.isin(self.group, STYLES)] if self.config else self.group[:0]
+        require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(STYLES)}")
+
+    def maps_of(self, split: str) -> np.ndarray:
+        """Indices of the maps of "train", "validation" or "test": [k]."""
+        require(split in SPLITS, "split", split, f"one of {', '.join(SPLITS)}")
+        return np.flatnonzero(self.split == SPLITS.index(split))
+
+
+def generate(
+    config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
+) -> Dataset:
+    """Makes and labels the maps; the same arguments give the same data set.
+
+    on_progress is called with the number of maps that were added. Memory: the arrays, 4.0 GB for the paper's 56,840
+    maps, and a few hundred MB of work. Raises InputError when robot, actions and grid do not fit together.
+    """
+    node_table(robot, actions, grid)
+    styles, seeds = config.styles(), config.seeds()
+    heights = np.empty((config.maps, *grid.shape), np.float32)
+    labels = np.empty((config.maps, len(actions)), np.uint8)
+    for start in range(0, config.maps, CHUNK):
+        chunk = slice(start, min(start + CHUNK, config.maps))
+        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid)
+        margins = simulate(made, robot, actions, grid=grid)
+        labels[chunk] = packed(failures(margins, robot), margins.known)
+        heights[chunk] = made
+        if on_progress:
+            on_progress(chunk.stop - start)
+    return Dataset(heights, labels, styles, seeds, config.splits(), robot, actions, grid, config)
+
+
+def require_same(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+    """Raises InputError, which names both, unless the data set is labelled for this robot, action space and grid."""
+    for name, given in (("robot", robot), ("actions", actions), ("grid", grid)):
+        ours = getattr(dataset, name)
+        if ours != given:
+            fields = [field.name for field in dataclasses.fields(ours)]
+            differing = [field for field in fields if getattr(ours, field) != getattr(given, field)]
+            both = (", ".join(f"{field} = {getattr(one, field)!r}" for field in differing) for one in (ours, given))
+            theirs, wanted = (textwrap.shorten(one, 160, placeholder=" ...") for one in both)
+            raise InputError(f"{name} of the data set: {theirs}; must be as here: {wanted}")
+
+
+def configs_to_json(dataset: Dataset) -> dict[str, Any]:
+    """Robot, actions, grid and config of a data set as JSON can hold them, with the version of travjax."""
+    parts = {name: getattr(dataset, name) for name in ("robot", "actions", "grid", "config")}
+    return {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
+
+
+def configs_from_json(table: dict[str, Any]) -> dict[str, Any]:
+    """The arguments robot, actions, grid and config of the Dataset that `configs_to_json` was given."""
+    kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid, "config": DatasetConfig}
+    return {name: table[name] and from_json(table[name], kind) for name, kind in kinds.items()}
+
+
+def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = None) -> None:
+    """Writes the data set to a folder, whole or not at all; a data set that lies there is replaced.
+
+    on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
+    or when it cannot be written: a full disk, no permission.
+    """
+    with folder_written_whole(Path(folder), _is_dataset) as temporary:
+        arrays = {f"{name}.npy": getattr(dataset, name) for name in ARRAYS}
+        files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
+        table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
+        (temporary / "dataset.json").write_text(json.dumps(table | {"sha256": _digest(table)}, indent=1) + "\n")
+
+
+def load(folder: str | Path) -> Dataset:
+    """Reads a data set that `save` wrote.
+
+    Raises InputError, which names folder, file and what is wrong, when something is missing, truncated or altered,
+    of another format version, or does not fit together.
+    """
+    folder = Path(folder)
+    require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
+    table = _read_table(folder / "dataset.json")
+    for name, file in table["files"].items():
+        _verify(folder / name, file["bytes"], file["sha256"])
+    try:
+        arrays = {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in ARRAYS}
+        return Dataset(**arrays, **configs_from_json(table))
+    except (InputError, OSError, ValueError) as error:
+        raise InputError(f"{folder}: {error}") from None
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    try:
+        table = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except ValueError as error:
+        raise InputError(f"{path}: not JSON: {error}") from None
+    if not isinstance(table, dict) or table.get("format") != FORMAT:
+        raise InputError(f"{path}: not the description of a {FORMAT}")
+    if table.get("version") != FORMAT_VERSION:
+        raise InputError(f"{path}: format version {table.get('version')!r}: must be {FORMAT_VERSION}; make it again")
+    if table.pop("sha256", None) != _digest(table):
+        raise InputError(f"{path}: has been altered: its checksum differs")
+    return table
+
+
+def _verify(path: Path, size: int, sha256: str) -> None:
+    try:
+        found = path.stat().st_size
+        if found != size:
+            raise InputError(f"{path}: {found} bytes: must be {size}; it was truncated or overwritten")
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if digest != sha256:
+        raise InputError(f"{path}: has been altered: its SHA-256 is {digest[:12]}..., and was {sha256[:12]}...")
+
+
+class _Hashing:
+    """A file to write to that hashes and counts what goes through it."""
+
+    def __init__(self, file, on_progress: Progress | None):
+        self.file, self.on_progress = file, on_progress
+        self.sha256, self.bytes = hashlib.sha256(), 0
+
+    def write(self, data: bytes) -> None:
+        self.file.write(data)
+        self.sha256.update(data)
+        self.bytes += len(data)
+        if self.on_progress:
+            self.on_progress(len(data))
+
+
+def _write(path: Path, array: np.ndarray, on_progress: Progress | None) -> dict[str, Any]:
+    """Writes a .npy file piece by piece; returns its size and checksum."""
+    with path.open("wb") as file:
+        hashing = _Hashing(file, on_progress)
+        np.lib.format.write_array(hashing, array, allow_pickle=False)
+    return {"bytes": hashing.bytes, "sha256": hashing.sha256.hexdigest()}
+
+
+def _digest(table: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(table, sort_keys=True, allow_nan=False).encode()).hexdigest()
+
+
+def _is_dataset(folder: Path) -> bool:
+    """Whether the folder holds a data set of any version and nothing else."""
+    try:
+        table = json.loads((folder / "dataset.json").read_text())
+        ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS)}
+        return table["format"] == FORMAT and {path.name for path in folder.iterdir()} <= ours
+    except (OSError, ValueError, TypeError, KeyError):
+        return False
+
+
+@contextmanager
+def folder_written_whole(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
+    """A temporary folder beside `folder` to write to; it becomes `folder` when the block ends well, else it is removed.
+
+    Raises InputError when it cannot be written, or when a file or a folder that is not `replaceable` lies there.
+    """
+    place = folder.resolve()
+    temporary, aside = (place.with_name(f".{os.getpid()}-{mark}{place.name}") for mark in ("", "old-"))
+    try:
+        taken = place.exists() and not (place.is_dir() and (not any(place.iterdir()) or replaceable(place)))
+        if taken:
+            raise InputError(
+                f"{folder}: holds something else: must be a new or empty folder, or an older one of its kind"
+            )
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
+        yield temporary
+        if place.exists():
+            place.rename(aside)
+        temporary.rename(place)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if aside.exists() and not place.exists():
+            aside.rename(place)
+        shutil.rmtree(aside, ignore_errors=True)

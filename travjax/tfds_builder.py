@@ -1,0 +1,156 @@
+"""The data set as a tensorflow-datasets builder, written as array_record and read without TensorFlow.
+
+    export(dataset, "runs/tfds")
+    source = tfds.builder("travjax", data_dir="runs/tfds").as_data_source("train")
+    source[0]["elevation"]
+
+One example is one map: `elevation` [rows, cols] float32 metres, NaN unknown; `labels` [t] uint8, of each trajectory's
+byte bits 0 to 2 say that step, obstacle and tilt failed, bit 3 unknown; `style`, or the site of a real map; `seed` of
+its terrain; `map`, its index in the data set. Robot, actions, grid and config are in the builder's metadata.
+"""
+
+import json
+import shutil
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from travjax.config import InputError, require
+from travjax.dataset import SPLITS, Dataset, configs_from_json, configs_to_json, folder_written_whole
+
+NAME, VERSION = "travjax", "1.0.0"
+
+METADATA = "metadata.json"
+"""The file in which tensorflow-datasets keeps a builder's metadata."""
+
+
+def export(dataset: Dataset, folder: str | Path, on_progress: Callable[[int], object] | None = None) -> None:
+    """Writes the data set as tensorflow-datasets keep it, below `folder`, whole or not at all; replaces an earlier one.
+
+    on_progress is called with the number of maps that were added. Splits without maps are left out. Raises InputError
+    when tensorflow-datasets is missing, when something else lies there, or when it cannot be written.
+    """
+    tfds = _tensorflow_datasets()
+    with folder_written_whole(Path(folder), _is_export) as temporary:
+        builder = _builder_class(tfds, dataset, on_progress)(data_dir=temporary, file_format="array_record")
+        downloads, no_bucket = temporary / "downloads", tfds.download.DownloadConfig(try_download_gcs=False)
+        tfds.disable_progress_bar()
+        try:
+            builder.download_and_prepare(download_dir=downloads, download_config=no_bucket)
+        except RuntimeError as error:  # from the writer of array_record files
+            raise InputError(f"{folder}: cannot be written: {' '.join(str(error).split())}") from None
+        finally:
+            tfds.enable_progress_bar()
+        shutil.rmtree(downloads)
+
+
+def read(folder: str | Path) -> Dataset:
+    """Reads back what `export` wrote to `folder`, equal to what was exported.
+
+    Raises InputError when tensorflow-datasets is missing, when there is no such data set, or when it is damaged.
+    """
+    tfds = _tensorflow_datasets()
+    place = Path(folder) / NAME / VERSION
+    require(_is_export(Path(folder)), "folder", str(folder), f"one with an exported data set in {NAME}/{VERSION}")
+    try:
+        builder = tfds.builder_from_directory(place)
+        return _collected(builder, configs_from_json(builder.info.metadata))
+    except Exception as error:  # a damaged record raises whatever the reader of its format does
+        raise InputError(f"{place}: damaged: {' '.join(str(error).split()) or type(error).__name__}") from None
+
+
+def _collected(builder: Any, configs: dict[str, Any]) -> Dataset:
+    splits = builder.info.splits
+    count = sum(split.num_examples for split in splits.values())
+    heights = np.empty((count, *configs["grid"].shape), np.float32)
+    labels = np.empty((count, len(configs["actions"])), np.uint8)
+    seed = np.empty(count, np.uint32)
+    split = np.full(count, len(SPLITS), np.uint8)  # no split: a map that is missing is found by it
+    group = [""] * count
+    for name in splits:
+        source = builder.as_data_source(name)
+        for place in range(len(source)):
+            example = source[place]
+            index = example["map"]
+            heights[index], labels[index], seed[index] = example["elevation"], example["labels"], example["seed"]
+            group[index], split[index] = example["style"].decode(), SPLITS.index(name)
+    return Dataset(heights, labels, np.array(group), seed, split, **configs)
+
+
+def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], object] | None) -> type:
+    """The builder of one data set; a class in a function, since its base is imported when it is needed."""
+
+    class Information(tfds.core.DatasetInfo):
+        def initialize_from_bucket(self) -> None:
+            """Asks no bucket on the network whether it knows the data set."""
+
+    class Travjax(tfds.core.GeneratorBasedBuilder, skip_registration=True):  # type: ignore[call-arg]
+        name = NAME
+        VERSION = tfds.core.Version(VERSION)
+
+        def _info(self):
+            features = {
+                "elevation": tfds.features.Tensor(shape=dataset.grid.shape, dtype=np.float32, encoding="bytes"),
+                "labels": tfds.features.Tensor(shape=(len(dataset.actions),), dtype=np.uint8, encoding="bytes"),
+                "style": tfds.features.Text(),
+                "seed": tfds.features.Scalar(np.uint32),
+                "map": tfds.features.Scalar(np.int64),
+            }
+            return Information(
+                builder=self,
+                description="Elevation maps and which trajectories of a wheeled robot fail on them.",
+                features=tfds.features.FeaturesDict(features),
+                metadata=tfds.core.MetadataDict(configs_to_json(dataset)),
+                disable_shuffling=True,
+            )
+
+        def _split_generators(self, dl_manager):
+            members = {split: dataset.maps_of(split) for split in SPLITS}
+            return {split: self._generate_examples(maps) for split, maps in members.items() if len(maps)}
+
+        def _generate_examples(self, maps):
+            for index in maps.tolist():
+                yield index, _example(dataset, index)
+                if on_progress:
+                    on_progress(1)
+
+        def _log_download_bytes(self) -> None:
+            """Prints nothing."""
+
+        _log_download_done = _log_download_bytes
+
+    return Travjax
+
+
+def _example(dataset: Dataset, index: int) -> dict[str, Any]:
+    return {
+        "elevation": dataset.heights[index],
+        "labels": dataset.labels[index],
+        "style": str(dataset.group[index]),
+        "seed": dataset.seed[index],
+        "map": index,
+    }
+
+
+def _is_export(folder: Path) -> bool:
+    """Whether the folder holds an exported data set and nothing else."""
+    try:
+        metadata = json.loads((folder / NAME / VERSION / METADATA).read_text())
+        return "travjax" in metadata and [path.name for path in folder.iterdir()] == [NAME]
+    except (OSError, ValueError, TypeError):
+        return False
+
+
+def _tensorflow_datasets() -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on import, its dependencies warn of each other
+        try:
+            import tensorflow_datasets as tfds  # type: ignore[import-untyped]
+        except ImportError as error:
+            raise InputError(
+                f"tensorflow-datasets cannot be imported ({error}); allowed: pip install 'travjax[tfds]'"
+            ) from None
+    return tfds
