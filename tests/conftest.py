@@ -6,12 +6,14 @@ Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest
 import math
 import os
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import hypothesis
 import jax
 import numpy as np
 import pytest
+from commandline import FEW_TOML
 
 from travjax.actions import ActionSpace
 from travjax.grid import Grid
@@ -129,3 +131,24 @@ SETTINGS = {
 def setting(request) -> Setting:
     """Each of the settings in turn."""
     return SETTINGS[request.param]
+
+
+@pytest.fixture(scope="module")
+def compilation_cache(tmp_path_factory) -> Path:
+    """Keeps code that commands compile away from the user's own cache, and JAX as it was for other tests."""
+    settings = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
+    before = {name: getattr(jax.config, name) for name in (*settings, "jax_compilation_cache_dir")}
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
+        yield folder
+    for name, value in before.items():
+        jax.config.update(name, value)
+
+
+@pytest.fixture(scope="session")
+def few(tmp_path_factory) -> Path:
+    """A small action space, commandline.FEW, as a TOML file."""
+    path = tmp_path_factory.mktemp("actions") / "few.toml"
+    path.write_text(FEW_TOML)
+    return path

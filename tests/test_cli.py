@@ -1,28 +1,25 @@
 """The command line end to end, and the one line for each bad input."""
 
-import contextlib
 import hashlib
-import io
 import json
-import math
 import os
 import re
 import subprocess
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import NamedTuple
 
-import jax
 import numpy as np
 import pytest
 import rasterio
 from affine import Affine
+from commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 from PIL import Image
 
 import travjax
 from travjax import cli, labelling
 from travjax.actions import ActionSpace
+from travjax.commands import label as label_command
 from travjax.grid import Grid
 from travjax.report import shares_table
 from travjax.robot import Robot
@@ -30,65 +27,8 @@ from travjax.terrain import FIELDS
 
 CELL = 0.0625
 SEEKUR_JR = Robot.load("seekur_jr")
-FEW = ActionSpace(turns=2, arc_lengths=(0.5, 0.6), radii=(math.inf, 1.5, -1.5), interval=0.1)
-FEW_TOML = "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n"
 
-
-class Run(NamedTuple):
-    """What one command did."""
-
-    code: int
-    out: str
-    err: str
-    folder: Path
-
-    def arrays(self, name: str = "labels.npz") -> dict[str, np.ndarray]:
-        with np.load(self.folder / name) as file:
-            return dict(file)
-
-
-def run(folder: Path, *words) -> Run:
-    """`travjax words... --out folder` in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = cli.main([*map(str, words), "--out", str(folder)])
-    return Run(code, out.getvalue(), err.getvalue(), folder)
-
-
-def succeeds(folder: Path, *words) -> Run:
-    done = run(folder, *words)
-    assert done.code == 0, done.err
-    return done
-
-
-def printed_files(done: Run) -> set[Path]:
-    """The lines that are paths."""
-    return {Path(line) for line in done.out.splitlines() if line.startswith(str(done.folder))}
-
-
-def files(folder: Path) -> set[Path]:
-    return set(folder.rglob("*")) if folder.exists() else set()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def cache(tmp_path_factory) -> Path:
-    """Keeps compiled code away from the user's own cache, and JAX as it was for other tests."""
-    settings = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
-    before = {name: getattr(jax.config, name) for name in (*settings, "jax_compilation_cache_dir")}
-    with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("cache")
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
-        yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
-@pytest.fixture(scope="module")
-def few(tmp_path_factory) -> Path:
-    """A small action space as a TOML file."""
-    path = tmp_path_factory.mktemp("actions") / "few.toml"
-    path.write_text(FEW_TOML)
-    return path
+pytestmark = pytest.mark.usefixtures("compilation_cache")
 
 
 # ---- Synthetic maps
@@ -579,7 +519,7 @@ def test_bad_input_is_one_line_with_exit_code_2_and_nothing_written(bad, tmp_pat
     old.write_text("old")
     words = [word.replace("BAD", str(bad)) for word in words]
     # Without a command there is no --out either.
-    done = run(old.parent, *words) if words else Run(*alone(), old.parent)
+    done = run(old.parent, *words) if words else Run(*run_words(), old.parent)
     assert done.code == 2
     assert "Traceback" not in done.err
     assert len(done.err.splitlines()) == 1, done.err
@@ -587,13 +527,6 @@ def test_bad_input_is_one_line_with_exit_code_2_and_nothing_written(bad, tmp_pat
     assert re.search(expected.replace("BAD", re.escape(str(bad))), done.err)
     assert files(old.parent) == {old}
     assert old.read_text() == "old"
-
-
-def alone() -> tuple[int, str, str]:
-    """`travjax` without a word."""
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        return cli.main([]), out.getvalue(), err.getvalue()
 
 
 @pytest.mark.parametrize("name", ["zero count", "text.tif", "negative dimension", "radius inside the robot"])
@@ -633,7 +566,7 @@ def test_an_interruption_is_one_line_and_leaves_nothing_half_written(tmp_path, f
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "save_npz", interrupt)
+    monkeypatch.setattr(label_command, "save_npz", interrupt)
     done = run(tmp_path, "label", "--count", 1, "--actions", few, "--no-figures")
     assert done.code == 130
     assert done.err.splitlines()[-1] == "travjax: interrupted"

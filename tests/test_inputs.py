@@ -21,8 +21,8 @@ from travjax.robot import Robot
 
 PAPER = ActionSpace()
 LEVEL = 1 / 255
-TOLERANCE = LEVEL / 2 + 1e-3
-"""Half a level of uint8 and a thousandth for geometry; SPEC asks for 0.02."""
+TOLERANCE = LEVEL / 2 + 3e-4
+"""Half a level of uint8, and float32 geometry; SPEC asks for 0.02."""
 
 STEP = 2.5e-4
 """Metres of path between the points of the float64 rendering; between them paths are taken as straight."""
@@ -121,12 +121,12 @@ def relative_elevation(heights: np.ndarray, scale: float) -> np.ndarray:
     return np.nan_to_num(np.clip((heights - heights[rows[nearest], cols[nearest]]) / scale, -4, 4))
 
 
-def assert_rendered(images, setting: Setting, trajectories, tolerance=TOLERANCE):
+def assert_rendered(images, setting: Setting, trajectories):
     assert images.shape == (len(trajectories), *setting.grid.shape, 2)
     assert images.dtype == np.uint8
     for image, trajectory in zip(np.asarray(images), trajectories, strict=True):
         expected = rendered(*setting, int(trajectory))
-        np.testing.assert_allclose(image / 255, expected, rtol=0, atol=tolerance, err_msg=f"trajectory {trajectory}")
+        np.testing.assert_allclose(image / 255, expected, rtol=0, atol=TOLERANCE, err_msg=f"trajectory {trajectory}")
 
 
 def channels(setting: Setting, trajectories) -> np.ndarray:
@@ -176,11 +176,11 @@ def test_trajectories_that_turn_far_are_as_rendered(name):
 
 
 def test_trajectories_that_hardly_turn_are_as_rendered():
-    """Whether an arc or a line is drawn: 0.2 mm between the two are 0.007 in the middle of a wheel's way."""
+    """The centres of their circles lie far off the map, where float32 sees little."""
     radii = (math.inf, 30.0, -300.0, 1e3, -2e3, 1e4, -1e6)
     setting = Setting(SEEKUR_JR, ActionSpace(turns=3, radii=radii, interval=0.1))
     sample = setting.actions.index(np.arange(7) % 3, np.arange(7), np.arange(7)[::-1])
-    assert_rendered(channels(setting, sample), setting, sample, tolerance=0.01)
+    assert_rendered(channels(setting, sample), setting, sample)
 
 
 lengths = st.floats(0.2, 2.5)

@@ -62,6 +62,8 @@ def to_json(config: object) -> dict[str, Any]:
     """A configuration dataclass as JSON can hold it: tuples are lists, and an infinite number in one is "inf"."""
 
     def plain(value):
+        if dataclasses.is_dataclass(value):
+            return to_json(value)
         if isinstance(value, tuple):
             items = [plain(item) for item in value]
             return [str(item) if item in (math.inf, -math.inf) else item for item in items]
@@ -74,7 +76,7 @@ def from_json(table: dict[str, Any], kind: type[Config]) -> Config:
     """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
     infinite = {"inf": math.inf, "-inf": -math.inf}
     lists = {key: [infinite.get(item, item) for item in value] for key, value in table.items() if type(value) is list}
-    return kind(**_fields_from(table | lists, kind))
+    return kind(**_fields_from(table | lists, kind))  # tables within a table hold no infinite numbers
 
 
 def _fields_from(table: dict, kind: type) -> dict:
@@ -90,8 +92,19 @@ def _fields_from(table: dict, kind: type) -> dict:
         if degrees:
             require_number(key, value, -math.inf, math.inf, "a number of degrees")
             value = math.radians(value)
+        if dataclasses.is_dataclass(names[name].default):
+            value = _inner(key, value, type(names[name].default))
         values[name] = tuple(value) if isinstance(value, list) else value
     missing = [n for n, f in names.items() if n not in values and f.default is dataclasses.MISSING]
     if missing:
         raise InputError(f"missing {', '.join(missing)}")
     return values
+
+
+def _inner(key: str, table: object, kind: type) -> object:
+    """The configuration of a table within a table."""
+    require(isinstance(table, dict), key, table, f"a table [{key}]")
+    try:
+        return kind(**_fields_from(table, kind))  # type: ignore[arg-type]
+    except InputError as error:
+        raise InputError(f"[{key}] {error}") from None

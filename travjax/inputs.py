@@ -12,6 +12,7 @@ import hashlib
 import zipfile
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -90,13 +91,30 @@ def _checked_index(name: str, index, count: int) -> np.ndarray:
     return numbers
 
 
+@partial(jax.tree_util.register_dataclass, data_fields=["heights", "bank", "elevation_scale"], meta_fields=[])
+@dataclass(frozen=True)
+class ImageSource:
+    """What images are put together from, on the device.
+
+    heights: [n, rows, cols] metres; bank: [t, rows, cols, 2] bytes; elevation_scale: metres that count as 1
+    """
+
+    heights: Float[Array, "n rows cols"] | Float[np.ndarray, "n rows cols"]
+    bank: UInt8[Array, "t rows cols 2"] | UInt8[np.ndarray, "t rows cols 2"]
+    elevation_scale: float | np.float32
+
+    def images(self, map_index: Int[Array, " b"], trajectory_index: Int[Array, " b"]) -> Float[Array, "b rows cols 3"]:
+        """Images of samples, as `assemble` makes them."""
+        return assemble(self.heights, self.bank, map_index, trajectory_index, self.elevation_scale)
+
+
 @jax.jit
 def assemble(
-    heights: Float[Array, "n rows cols"],
-    bank: UInt8[Array, "t rows cols 2"],
+    heights: Float[Array, "n rows cols"] | Float[np.ndarray, "n rows cols"],
+    bank: UInt8[Array, "t rows cols 2"] | UInt8[np.ndarray, "t rows cols 2"],
     map_index: Int[Array, " b"],
     trajectory_index: Int[Array, " b"],
-    elevation_scale: float = 1.0,
+    elevation_scale: float | np.float32 = 1.0,
 ) -> Float[Array, "b rows cols 3"]:
     """Images of samples, on the device: the map's elevation channel beside the bank's two of the trajectory."""
     elevation = elevation_channel(heights[map_index], elevation_scale)
@@ -105,7 +123,7 @@ def assemble(
 
 
 def elevation_channel(
-    heights: Float[Array, "b rows cols"], scale: float | Float[Array, ""] = 1.0
+    heights: Float[Array, "b rows cols"], scale: float | np.float32 | Float[Array, ""] = 1.0
 ) -> Float[Array, "b rows cols"]:
     """Heights above the robot's in units of `scale` metres, clipped; unknown ground is 0.
 

@@ -128,9 +128,9 @@ def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[A
     return (bits << jnp.arange(4)).sum(axis=-1).astype(jnp.uint8)
 
 
-def unpacked(labels: UInt8[Array, "*n t"]) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
-    """The (failed, known) that `packed` was given."""
-    bits = (labels[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
+def unpacked(labels) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
+    """The (failed, known) that `packed` was given, from its labels: [n, t] uint8."""
+    bits = (jnp.asarray(labels)[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
     return bits[..., :3].astype(bool), bits[..., 3] == 0
 
 

@@ -1,0 +1,661 @@
+"""Converted weights against Keras, torch and recorded activations, and the one line for each file that is wrong.
+
+The names in the files are written here by the oracles, never by the module under test.
+"""
+
+import json
+import os
+import pickle
+import sys
+import warnings
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import h5py
+import huggingface_hub
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import load_file, save_file
+
+from travjax.config import InputError
+from travjax.imagenet import Weights, apply_weights, describe, fetch, load_weights, save_safetensors
+from travjax.resnet import ResNet, ResNetConfig
+
+NARROW = ResNetConfig(width=4)
+"""All the layers of ResNet50, so all of their names, and few channels."""
+
+SHARED = Path(os.environ.get("TRAVJAX_DATA", Path(__file__).parents[1] / "../shared/data")) / "imagenet"
+MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+BLOCKS = {2: "abc", 3: "abcd", 4: "abcdef", 5: "abc"}
+SUFFIXES = [".npz", ".h5", ".safetensors", ".pth"]
+
+
+def canonical_arrays(width: int = 4, top: bool = True, seed: int = 0) -> dict[str, np.ndarray]:
+    """Random weights and statistics of a ResNet50 by canonical name, in a layout written down once more."""
+    random = np.random.default_rng(seed)
+    layers = {"conv1": (7, 3, width)}
+    inputs = width
+    for stage, letters in BLOCKS.items():
+        inner = width * 2 ** (stage - 2)
+        for letter in letters:
+            block = f"res{stage}{letter}_branch"
+            layers |= {f"{block}2a": (1, inputs, inner), f"{block}2b": (3, inner, inner)}
+            layers[f"{block}2c"] = (1, inner, 4 * inner)
+            if letter == "a":
+                layers[f"{block}1"] = (1, inputs, 4 * inner)
+            inputs = 4 * inner
+    arrays = {}
+    for layer, (size, fan_in, out) in layers.items():
+        spread = np.sqrt(2 / (size**2 * fan_in))
+        arrays[f"{layer}/kernel"] = spread * random.standard_normal((size, size, fan_in, out), np.float32)
+        for array, low, high in (("gamma", 0.3, 0.9), ("beta", -0.3, 0.3), ("mean", -0.3, 0.3), ("var", 0.5, 1.5)):
+            arrays[f"{layer}/{array}"] = random.uniform(low, high, out)
+    if top:
+        arrays["fc1000/kernel"] = random.standard_normal((inputs, 1000)) / np.sqrt(inputs)
+        arrays["fc1000/bias"] = random.standard_normal(1000)
+    return {name: array.astype(np.float32) for name, array in arrays.items()}
+
+
+def torchvision_arrays(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same in the names and layout of torchvision."""
+    convolutions = {"2a": "conv1", "2b": "conv2", "2c": "conv3", "1": "downsample.0"}
+    norms = {"2a": "bn1", "2b": "bn2", "2c": "bn3", "1": "downsample.1"}
+    kinds = {"gamma": "weight", "beta": "bias", "mean": "running_mean", "var": "running_var"}
+    named = {}
+    for name, array in arrays.items():
+        layer, kind = name.split("/")
+        if layer == "fc1000":
+            named["fc.weight" if kind == "kernel" else "fc.bias"] = np.ascontiguousarray(array.T)
+            continue
+        block, convolution, norm = "", "conv1", "bn1"
+        if layer != "conv1":
+            branch = layer.split("_branch")[1]
+            block = f"layer{int(layer[3]) - 1}.{'abcdef'.index(layer[4])}."
+            convolution, norm = convolutions[branch], norms[branch]
+        if kind == "kernel":
+            named[f"{block}{convolution}.weight"] = np.ascontiguousarray(array.transpose(3, 2, 0, 1))
+            named[f"{block}{norm}.num_batches_tracked"] = np.array(7)
+        else:
+            named[f"{block}{norm}.{kinds[kind]}"] = array
+    return named
+
+
+def write(path: Path, arrays: dict[str, np.ndarray]) -> Path:
+    """Arrays by the names that they have in the file; in an .h5 they lie a group deeper, as Keras 2 does it."""
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    elif path.suffix == ".safetensors":
+        save_file(arrays, path)
+    elif path.suffix == ".pth":
+        torch = pytest.importorskip("torch")
+        torch.save({name: torch.tensor(np.array(array)) for name, array in arrays.items()}, path)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, array in arrays.items():
+                file[f"{name.split('/')[0]}/{name}:0"] = array
+    return path
+
+
+def keras_arrays(arrays: dict[str, np.ndarray], caffe: bool = False) -> dict[str, np.ndarray]:
+    """Canonical arrays in the names of Keras, with biases of zero, as "layer/array"."""
+    kinds = {"gamma": "gamma", "beta": "beta", "mean": "moving_mean", "var": "moving_variance"}
+    named = {}
+    for name, array in arrays.items():
+        layer, kind = name.split("/")
+        if layer == "fc1000":
+            named[name if caffe else f"predictions/{kind}"] = array
+            continue
+        norm = "bn_conv1" if layer == "conv1" else f"bn{layer[3:]}"
+        convolution = layer
+        if not caffe:
+            block = f"conv{layer[3]}_block{'abcdef'.index(layer[4]) + 1}_" if layer != "conv1" else "conv1"
+            number = {"1": "0", "2a": "1", "2b": "2", "2c": "3"}[layer.split("_branch")[1]] if layer != "conv1" else ""
+            convolution, norm = f"{block}{number}_conv", f"{block}{number}_bn"
+        if kind == "kernel":
+            named[f"{convolution}/kernel"] = array
+            named[f"{convolution}/bias"] = np.zeros(array.shape[-1], np.float32)
+        else:
+            named[f"{norm}/{kinds[kind]}"] = array
+    return named
+
+
+def arrays_in_file(suffix: str, **options) -> dict[str, np.ndarray]:
+    """Weights of NARROW as a file of this kind names them."""
+    arrays = canonical_arrays(**options)
+    return {".npz": lambda a: a, ".h5": keras_arrays}.get(suffix, torchvision_arrays)(arrays)
+
+
+def run(weights: Weights, images: np.ndarray, **config) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Features and stages of a network with these weights."""
+    config = replace(ResNetConfig(stride_in=weights.stride_in), **config)
+    resnet = nnx.eval_shape(lambda: ResNet(config, rngs=nnx.Rngs(0)))
+    apply_weights(resnet, weights)
+    return forward(*nnx.split(resnet), images)
+
+
+@partial(jax.jit, static_argnums=0)
+def forward(graph, state, images):
+    return nnx.merge(graph, state)(images)
+
+
+def assert_close(found, wanted, rtol: float = 1e-4):
+    """To a share of the largest value."""
+    wanted = np.asarray(wanted)
+    np.testing.assert_allclose(found, wanted, rtol=0, atol=rtol * np.abs(wanted).max())
+
+
+def normalised(count: int = 2, size: int = 64) -> np.ndarray:
+    """Made-up (x / 255 - mean) / std of RGB pixels."""
+    return np.random.default_rng(5).standard_normal((count, size, size, 3)).astype(np.float32)
+
+
+# Keras
+
+
+@pytest.fixture(scope="module")
+def keras_model():
+    """Keras' own ResNet50 with random weights, biases and statistics."""
+    os.environ["KERAS_BACKEND"] = "jax"
+    keras = pytest.importorskip("keras")
+    model = keras.applications.ResNet50(weights=None, input_shape=(64, 64, 3))
+    random = np.random.default_rng(1)
+    for layer in model.layers:
+        for variable in layer.weights:
+            shape, kind = variable.shape, variable.path.split("/")[-1]
+            if kind == "kernel":
+                value = random.standard_normal(shape, np.float32) * np.sqrt(2 / np.prod(shape[:-1]))
+            else:
+                value = random.uniform(
+                    *{"gamma": (0.3, 0.9), "moving_variance": (0.5, 1.5)}.get(kind, (-0.3, 0.3)), shape
+                )
+            variable.assign(value)
+    first = model.get_layer("conv1_conv").kernel
+    first.assign(first / 60)  # made for pixels of 0 to 255
+    return model
+
+
+@pytest.fixture(scope="module")
+def keras_stages(keras_model) -> dict[str, np.ndarray]:
+    """What Keras computes, from its own kind of pixels."""
+    import keras
+
+    layers = {
+        "stem": "pool1_pool",
+        "stage2": "conv2_block3_out",
+        "stage3": "conv3_block4_out",
+        "stage4": "conv4_block6_out",
+        "stage5": "conv5_block3_out",
+        "features": "avg_pool",
+        "classes": "predictions",
+    }
+    outputs = {name: keras_model.get_layer(layer).output for name, layer in layers.items()}
+    pixels = (normalised() * (255 * STD))[..., ::-1].astype(np.float32)
+    computed = keras.Model(keras_model.input, outputs)(pixels, training=False)
+    return {name: np.asarray(array) for name, array in computed.items()}
+
+
+@pytest.fixture(scope="module")
+def keras_weights(keras_model, tmp_path_factory) -> dict[str, Weights]:
+    """What is read back from each kind of file that Keras 2 and 3 write."""
+    import keras
+    from keras.src.legacy.saving import legacy_h5_format
+
+    folder = tmp_path_factory.mktemp("keras")
+    without_top = keras.Model(keras_model.input, keras_model.get_layer("conv5_block3_out").output)
+    weights = {}
+    for top, model in (("with top", keras_model), ("without top", without_top)):
+        numbered, grouped = folder / "numbered.weights.h5", folder / "grouped.h5"
+        with warnings.catch_warnings(), h5py.File(grouped, "w") as file:
+            warnings.simplefilter("ignore", DeprecationWarning)  # Keras converts its arrays as NumPy 1 did
+            model.save_weights(numbered)
+            legacy_h5_format.save_weights_to_hdf5_group(file, model)
+        weights[f"Keras 3, {top}"] = load_weights(numbered)
+        weights[f"Keras 2, {top}"] = load_weights(grouped)
+    return weights
+
+
+LAYOUTS = [f"Keras {version}, {top} top" for version in (2, 3) for top in ("with", "without")]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_of_keras_gives_the_same_weights(keras_weights, layout):
+    weights, first = keras_weights[layout], keras_weights[LAYOUTS[0]]
+    assert (weights.classifier is None) == ("without" in layout)
+    assert (weights.naming, weights.stride_in, weights.epsilon) == ("Keras", "1x1", 1.001e-5)
+    assert len(weights.arrays) == 53 * 5 + (2 if "with top" in layout else 0)
+    for name, array in weights.arrays.items():
+        assert array.dtype == np.float32
+        np.testing.assert_array_equal(array, first.arrays[name])
+
+
+def test_every_stage_of_a_converted_network_is_that_of_keras(keras_weights, keras_stages):
+    weights = keras_weights["Keras 3, with top"]
+    features, stages = run(weights, normalised())
+    for name, stage in stages.items():
+        assert np.abs(keras_stages[name]).max() > 0.1
+        assert_close(stage, keras_stages[name])
+    assert_close(features, keras_stages["features"])
+    kernel, bias = weights.classifier
+    assert_close(jax.nn.softmax(features @ kernel + bias), keras_stages["classes"])
+
+
+def test_the_scale_of_the_first_kernel_brings_keras_to_the_range_of_the_others(keras_weights, keras_model):
+    """White noise of unit variance comes out of it as it would of a kernel of He's variance."""
+    kernel = keras_weights["Keras 3, with top"].arrays["conv1/kernel"]
+    stored = np.asarray(keras_model.get_layer("conv1_conv").kernel)
+    np.testing.assert_allclose(kernel[:, :, 0], stored[:, :, 2] * 255 * 0.229, rtol=1e-6)
+    assert kernel.std() == pytest.approx(np.sqrt(2 / (49 * 3)), rel=0.1)
+
+
+def test_names_of_keras_before_2_2(tmp_path):
+    arrays = canonical_arrays()
+    named = keras_arrays(arrays, caffe=True)
+    random = np.random.default_rng(0)
+    bias = {name: random.uniform(-1, 1, a.shape).astype(np.float32) for name, a in named.items() if "/bias" in name}
+    old = {"kernel": "W_1", "bias": "b_1", "moving_mean": "running_mean_1", "moving_variance": "running_std_1"}
+    keras_1 = tmp_path / "1.h5"
+    with h5py.File(keras_1, "w") as file:
+        for name, array in (named | bias).items():
+            layer, kind = name.split("/")
+            file[f"{layer}/{layer}_{old.get(kind, f'{kind}_1')}:0"] = array
+    one, two = load_weights(keras_1, NARROW), load_weights(write(tmp_path / "2.h5", named | bias), NARROW)
+    assert (one.naming, one.stride_in, one.epsilon) == ("Keras before 2.2", "1x1", 1e-3)
+    np.testing.assert_array_equal(one.classifier[1], bias["fc1000/bias"])
+    for name in arrays.keys() - {"conv1/kernel", "fc1000/bias"}:
+        wanted = arrays[name] - bias[f"{name[:-5]}/bias"] if name.endswith("/mean") else arrays[name]
+        np.testing.assert_array_equal(one.arrays[name], wanted)
+        np.testing.assert_array_equal(two.arrays[name], wanted)
+
+
+# torch
+
+
+def torch_stages(arrays: dict[str, np.ndarray], images: np.ndarray, v1_5: bool) -> dict[str, np.ndarray]:
+    """The network as torch functions on arrays in torchvision's names, float64."""
+    torch = pytest.importorskip("torch")
+    from torch.nn import functional
+
+    state = {name: torch.tensor(np.array(array), dtype=torch.float64) for name, array in arrays.items()}
+
+    def convolution(x, name, norm, stride, padding=0):
+        x = functional.conv2d(x, state[f"{name}.weight"], stride=stride, padding=padding)
+        kinds = ("running_mean", "running_var", "weight", "bias")
+        return functional.batch_norm(x, *(state[f"{norm}.{kind}"] for kind in kinds), eps=1e-5)
+
+    pixels_last = lambda x: x.permute(0, 2, 3, 1).numpy()
+    x = torch.tensor(images, dtype=torch.float64).permute(0, 3, 1, 2)
+    x = functional.max_pool2d(convolution(x, "conv1", "bn1", 2, 3).relu(), 3, 2, 1)
+    stages = {"stem": pixels_last(x)}
+    for layer, letters in enumerate(BLOCKS.values(), start=1):
+        for block in range(len(letters)):
+            name, stride = f"layer{layer}.{block}", 2 if layer > 1 and block == 0 else 1
+            first, second = (1, stride) if v1_5 else (stride, 1)
+            y = convolution(x, f"{name}.conv1", f"{name}.bn1", first).relu()
+            y = convolution(y, f"{name}.conv2", f"{name}.bn2", second, 1).relu()
+            if block == 0:
+                x = convolution(x, f"{name}.downsample.0", f"{name}.downsample.1", stride)
+            x = (x + convolution(y, f"{name}.conv3", f"{name}.bn3", 1)).relu()
+        stages[f"stage{layer + 1}"] = pixels_last(x)
+    features = x.mean((2, 3))
+    logits = functional.linear(features, state["fc.weight"], state["fc.bias"])
+    return stages | {"features": features.numpy(), "logits": logits.numpy()}
+
+
+@pytest.mark.parametrize(("suffix", "size"), [(".pth", 64), (".safetensors", 129)])
+def test_every_stage_of_a_converted_network_is_that_of_torch(tmp_path, suffix, size):
+    arrays = arrays_in_file(suffix)
+    weights = load_weights(write(tmp_path / f"resnet50{suffix}", arrays), NARROW)
+    assert (weights.naming, weights.stride_in, weights.epsilon) == ("torchvision", "3x3", 1e-5)
+    wanted = torch_stages(arrays, normalised(size=size), v1_5=True)
+    features, stages = run(weights, normalised(size=size), width=4)
+    for name, stage in stages.items():
+        assert_close(stage, wanted[name])
+    assert_close(features, wanted["features"])
+    kernel, bias = weights.classifier
+    assert_close(features @ kernel + bias, wanted["logits"])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_every_stage_of_a_v1_network_is_that_of_torch(tmp_path, suffix):
+    arrays = canonical_arrays()
+    weights = load_weights(write(tmp_path / f"resnet50{suffix}", arrays_in_file(suffix)), NARROW)
+    wanted = torch_stages(torchvision_arrays(arrays), normalised(), v1_5=False)
+    images = normalised()
+    if suffix == ".h5":  # whose kernels take B, G, R of 0 to 255
+        images = images[..., ::-1] / (255 * STD)
+    features, stages = run(weights, images.astype(np.float32), width=4)
+    for name, stage in stages.items():
+        assert_close(stage, wanted[name])
+    assert_close(features, wanted["features"])
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float64"])
+def test_other_precisions_are_read_exactly(tmp_path, dtype):
+    torch = pytest.importorskip("torch")
+    arrays = {name: array for name, array in arrays_in_file(".pth").items() if "num_batches" not in name}
+    rounded = {name: array.astype(jnp.dtype(dtype)) for name, array in arrays.items()}
+    safe = load_weights(write(tmp_path / "a.safetensors", rounded), NARROW)
+    torch.save(
+        {name: torch.tensor(array).to(getattr(torch, dtype)) for name, array in arrays.items()}, tmp_path / "a.pth"
+    )
+    pth = load_weights(tmp_path / "a.pth", NARROW)
+    wanted = rounded["layer3.5.conv2.weight"].astype(np.float32).transpose(2, 3, 1, 0)
+    for weights in (pth, safe):
+        assert {array.dtype for array in weights.arrays.values()} == {np.dtype(np.float32)}
+        np.testing.assert_array_equal(weights.arrays["res4f_branch2b/kernel"], wanted)
+
+
+# Our .npz
+
+
+def shared(name: str) -> Path:
+    path = SHARED / name
+    if not path.is_file():
+        pytest.skip(f"needs {path} (TRAVJAX_DATA is the folder above)")
+    return path
+
+
+def test_our_weights_compute_the_recorded_activations():
+    weights = load_weights(shared("resnet50_imagenet.npz"))
+    with np.load(shared("resnet50_check.npz")) as file:
+        check = dict(file)
+    features, stages = run(weights, ((check["images"] / 255 - MEAN) / STD).astype(np.float32))
+    assert stages.keys() == {"stem", "stage2", "stage3", "stage4", "stage5"}
+    for name, stage in stages.items():
+        assert_close(np.asarray(stage).mean((1, 2)), check[name])
+    kernel, bias = weights.classifier
+    assert_close(features @ kernel + bias, check["logits"])
+
+
+def test_our_weights_are_described():
+    weights = load_weights(shared("resnet50_imagenet.npz"))
+    assert sum((weights.arrays[name] == 0).all() for name in weights.arrays if name.endswith("gamma")) == 0
+    dead = sum(int((array == 0).sum()) for name, array in weights.arrays.items() if name.endswith("/gamma"))
+    assert dead == 763  # README of the data
+    rows = dict(line.split("  ", 1) for line in describe(weights).splitlines())
+    rows = {key.strip(): value.strip() for key, value in rows.items()}
+    assert rows["arrays"] == "267"
+    assert rows["zeros in kernels"] == "81.5%"
+    assert rows["top layer"] == "1000 classes"
+    assert rows["strides"] == "in the 1x1 convolutions (v1)"
+    assert rows["batch-norm epsilon"] == "1e-05"
+
+
+# Weights into a network
+
+
+@pytest.mark.parametrize("epsilon", [1e-7, 1e-3])
+def test_another_epsilon_of_the_network_leaves_its_function(tmp_path, epsilon):
+    arrays = canonical_arrays()
+    random = np.random.default_rng(2)
+    for name in [name for name in arrays if name.endswith("/var")]:
+        small = random.random(arrays[name].shape) < 0.3
+        arrays[name][small] *= 1e-6  # where epsilon dominates
+        arrays[name.replace("/var", "/gamma")][small] *= 1e-3
+        arrays[name.replace("/var", "/gamma")][:1] = 0  # a dead channel
+    weights = load_weights(write(tmp_path / "a.npz", arrays), NARROW)
+    wanted = torch_stages(torchvision_arrays(arrays), normalised(), v1_5=False)
+    assert_close(run(weights, normalised(), width=4, epsilon=epsilon)[0], wanted["features"])
+
+
+def test_applied_weights_are_parameters_and_statistics_of_their_names(tmp_path):
+    arrays = canonical_arrays()
+    resnet = nnx.eval_shape(lambda: ResNet(NARROW, rngs=nnx.Rngs(0)))
+    apply_weights(resnet, load_weights(write(tmp_path / "a.npz", arrays), NARROW))
+    np.testing.assert_array_equal(resnet.conv1.kernel[...], arrays["conv1/kernel"])
+    np.testing.assert_array_equal(resnet.res4f.branch2c.scale[...], arrays["res4f_branch2c/gamma"])
+    np.testing.assert_array_equal(resnet.res3a.branch1.bias[...], arrays["res3a_branch1/beta"])
+    np.testing.assert_array_equal(resnet.res5c.branch2b.mean[...], arrays["res5c_branch2b/mean"])
+    np.testing.assert_array_equal(resnet.res5c.branch2b.var[...], arrays["res5c_branch2b/var"])
+
+
+def test_weights_of_another_size_or_stride_are_refused_and_nothing_is_set(tmp_path):
+    weights = load_weights(write(tmp_path / "a.npz", canonical_arrays()), NARROW)
+    for wrong, message in (
+        (replace(NARROW, stride_in="3x3"), "stride_in = '3x3': must be \"1x1\", as in the network of these weights"),
+        (replace(NARROW, width=8), "config = .* width 8': must be of the size of these weights"),
+        (replace(NARROW, blocks=(1,)), r"config = .*\(1,\)"),
+    ):
+        resnet = nnx.eval_shape(lambda: ResNet(wrong, rngs=nnx.Rngs(0)))  # noqa: B023
+        with pytest.raises(InputError, match=message):
+            apply_weights(resnet, weights)
+        assert not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(nnx.state(resnet)))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("top", [True, False])
+def test_saved_weights_are_read_back_equal(tmp_path, suffix, top):
+    weights = load_weights(write(tmp_path / f"a{suffix}", arrays_in_file(suffix, top=top)), NARROW)
+    save_safetensors(weights, tmp_path / "b.safetensors")
+    again = load_weights(tmp_path / "b.safetensors", NARROW)
+    assert (again.stride_in, again.epsilon, again.origin) == (weights.stride_in, weights.epsilon, weights.origin)
+    assert again.origin.startswith(f"a{suffix}, ") and again.naming == "canonical"
+    assert again.arrays.keys() == weights.arrays.keys() == canonical_arrays(top=top).keys()
+    for name, array in weights.arrays.items():
+        np.testing.assert_array_equal(again.arrays[name], array)
+    assert f"{len(weights.arrays)}" in describe(again) and weights.origin in describe(again)
+
+
+def test_weights_that_cannot_be_saved_leave_nothing(tmp_path):
+    weights = load_weights(write(tmp_path / "a.npz", canonical_arrays()), NARROW)
+    (tmp_path / "b.safetensors").mkdir()
+    with pytest.raises(InputError, match="b.safetensors: cannot be written"):
+        save_safetensors(weights, tmp_path / "b.safetensors")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz", "b.safetensors"]
+
+
+# Wrong files
+
+
+def refusal(path: Path, config: ResNetConfig = NARROW) -> str:
+    """The error for a file, which is one line and names it."""
+    with pytest.raises(InputError) as error:
+        load_weights(path, config)
+    message = str(error.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+FIRST = {".npz": "conv1/kernel", ".h5": "conv1_conv/kernel", ".safetensors": "conv1.weight", ".pth": "conv1.weight"}
+SOME = {
+    ".npz": ["res2a_branch1/gamma", "res3b_branch2a/mean", "res4f_branch2c/var", "fc1000/bias"],
+    ".h5": [
+        "conv2_block1_0_bn/gamma",
+        "conv3_block2_1_conv/bias",
+        "conv4_block6_3_bn/moving_variance",
+        "predictions/bias",
+    ],
+    ".safetensors": [
+        "layer1.0.downsample.1.weight",
+        "layer2.1.bn1.running_mean",
+        "layer3.5.bn3.running_var",
+        "fc.bias",
+    ],
+}
+SOME[".pth"] = SOME[".safetensors"]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_all_mismatches_are_named_in_one_error_by_the_names_of_the_file(tmp_path, suffix):
+    arrays = arrays_in_file(suffix)
+    missing, shaped, negative_or_infinite, counted = SOME[suffix]
+    arrays.pop(missing)
+    arrays[shaped] = arrays[shaped][:-1]
+    arrays[negative_or_infinite] = np.full_like(arrays[negative_or_infinite], -1)
+    arrays[counted] = arrays[counted].astype(np.int32)
+    arrays[FIRST[suffix]][0, 0, 0, 0] = np.nan
+    arrays["another/layer"] = np.zeros(3, np.float32)
+    message = refusal(write(tmp_path / f"a{suffix}", arrays))
+    assert message.startswith("6 arrays of ")
+    for wrong in (
+        f"{missing} is missing",
+        "another/layer is unexpected",
+        f"{shaped} is [7], not [8]",
+        f"{negative_or_infinite} is negative somewhere",
+        f"{counted} is int32, not floating-point",
+        f"{FIRST[suffix]} is not finite throughout",
+    ):
+        assert wrong in message
+
+
+def test_of_many_mismatches_the_first_are_named_and_the_others_counted(tmp_path):
+    arrays = canonical_arrays()
+    lost = [name for name in arrays if name.startswith("res4")]
+    path = write(tmp_path / "a.npz", {name: array for name, array in arrays.items() if name not in lost})
+    message = refusal(path)
+    assert message.startswith(f"{len(lost)} arrays ") and message.endswith(f"; and {len(lost) - 6} more")
+    assert message.count("is missing") == 6
+
+
+def test_kernels_in_the_layout_of_another_framework_are_refused(tmp_path):
+    arrays = torchvision_arrays(canonical_arrays())
+    arrays["layer1.0.conv2.weight"] = arrays["layer1.0.conv1.weight"].transpose(2, 3, 1, 0)
+    assert "layer1.0.conv2.weight is [1, 1, 4, 4], not [4, 4, 3, 3]" in refusal(
+        write(tmp_path / "a.safetensors", arrays)
+    )
+
+
+def test_a_float64_beyond_float32_is_not_finite(tmp_path):
+    arrays = canonical_arrays() | {"res2a_branch1/beta": np.full(16, 1e300)}
+    assert "res2a_branch1/beta is not finite" in refusal(write(tmp_path / "a.npz", arrays))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_resnet_of_another_size_is_refused(tmp_path, suffix):
+    message = refusal(write(tmp_path / f"a{suffix}", arrays_in_file(suffix)), ResNetConfig())
+    assert f"{FIRST[suffix]} is " in message and "more" in message
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_arrays_of_another_network_are_refused(tmp_path, suffix):
+    message = refusal(write(tmp_path / f"a{suffix}", {"block1/filter": np.ones(3, np.float32)}))
+    assert message.startswith("no array of a ResNet among its 1; allowed names") and "conv1.weight" in message
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_truncated_file_is_refused(tmp_path, suffix, kept):
+    path = write(tmp_path / f"a{suffix}", arrays_in_file(suffix, top=False))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(kept * len(whole))])
+    message = refusal(path)
+    assert message.startswith((f"cannot be read as {suffix}, damaged or something else: ", "holds pickled code, which"))
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_file_of_something_else_is_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text("<html>404 not found</html>\n" * 40)
+    refusal(path)
+
+
+def test_bits_that_turned_over_in_an_npz_are_noticed(tmp_path):
+    path = write(tmp_path / "a.npz", canonical_arrays())
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(bytes(damaged))
+    assert "cannot be read as .npz" in refusal(path)
+
+
+class Malicious:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path: Path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("how", ["torch.save", "pickle 2", "pickle 4", "npz"])
+def test_pickled_code_is_not_run(tmp_path, how):
+    torch = pytest.importorskip("torch")
+    mark, path = tmp_path / "ran", tmp_path / "a.pth"
+    state = torchvision_arrays(canonical_arrays()) | {"conv1.weight": Malicious(mark)}
+    if how == "torch.save":
+        torch.save(state, path)
+    elif how == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, **canonical_arrays() | {"conv1/kernel": np.array([Malicious(mark)])})
+    else:
+        path.write_bytes(pickle.dumps(state, protocol=int(how[-1])))
+    message = refusal(path)
+    assert message.startswith("cannot be read as .npz" if how == "npz" else "holds pickled code, which is not run")
+    assert not mark.exists()
+    pickle.loads(pickle.dumps(Malicious(mark)))
+    assert mark.exists()  # it would have
+
+
+@pytest.mark.parametrize("content", [[1, 2], {"epoch": 3}, {"state_dict": {}}])
+def test_a_pth_without_tensors_by_name_is_refused(tmp_path, content):
+    torch = pytest.importorskip("torch")
+    torch.save(content, tmp_path / "a.pth")
+    assert "allowed: a saved state_dict()" in refusal(tmp_path / "a.pth")
+
+
+def test_a_keras_file_of_two_networks_is_refused(tmp_path):
+    path = write(tmp_path / "a.h5", arrays_in_file(".h5"))
+    with h5py.File(path, "a") as file:
+        file["second/conv1_conv/kernel:0"] = np.ones(3)
+    assert "holds conv1_conv/kernel twice" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("notes", "wrong"),
+    [
+        ({"epsilon": -1}, "epsilon = -1: must be"),
+        ({"epsilon": "1"}, "epsilon = '1': must be"),
+        ({"stride_in": "5x5"}, "stride_in = '5x5': must be"),
+        ([3], "cannot be read as .safetensors"),
+    ],
+)
+def test_altered_notes_of_saved_weights_are_refused(tmp_path, notes, wrong):
+    save_file(canonical_arrays(), tmp_path / "a.safetensors", metadata={"travjax": json.dumps(notes)})
+    assert wrong in refusal(tmp_path / "a.safetensors")
+
+
+def test_paths_that_are_no_file_of_weights(tmp_path):
+    (tmp_path / "a.npz").mkdir()
+    assert refusal(tmp_path / "a.npz") == "is a folder; allowed: a file"
+    assert refusal(tmp_path / "b.npz") == "no such file"
+    assert refusal(tmp_path / "b.onnx") == "unknown kind of file; allowed: .npz, .h5, .safetensors, .pth"
+
+
+@pytest.mark.parametrize(("suffix", "library"), [(".h5", "h5py"), (".pth", "torch")])
+def test_an_optional_library_that_is_not_there_is_named(tmp_path, monkeypatch, suffix, library):
+    path = write(tmp_path / f"a{suffix}", arrays_in_file(suffix, top=False))
+    monkeypatch.setitem(sys.modules, library, None)
+    assert f"pip install {library}" in refusal(path)
+
+
+# The hub
+
+
+def test_fetched_weights_can_be_loaded(tmp_path, monkeypatch):
+    path = write(tmp_path / "model.safetensors", arrays_in_file(".safetensors"))
+    asked = []
+    monkeypatch.setattr(huggingface_hub, "hf_hub_download", lambda *names: asked.append(names) or str(path))
+    assert load_weights(fetch("someone/resnet", "model.safetensors"), NARROW).naming == "torchvision"
+    assert asked == [("someone/resnet", "model.safetensors")]
+
+
+def test_a_file_that_cannot_be_fetched_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    for repository in ("someone/resnet", "no such/name/at all"):
+        with pytest.raises(InputError, match=f"^{repository}/model.safetensors: cannot be fetched; .*a file") as error:
+            fetch(repository, "model.safetensors")
+        assert "\n" not in str(error.value)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    with pytest.raises(InputError, match="pip install huggingface_hub"):
+        fetch()
+
+
+def test_saved_files_are_canonical_safetensors(tmp_path):
+    weights = load_weights(write(tmp_path / "a.npz", canonical_arrays()), NARROW)
+    save_safetensors(weights, tmp_path / "b.safetensors")
+    assert load_file(tmp_path / "b.safetensors").keys() == canonical_arrays().keys()

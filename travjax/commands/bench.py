@@ -1,0 +1,56 @@
+"""`travjax bench`: how fast terrain and labelling are on this machine."""
+
+import argparse
+
+import jax
+from tqdm import tqdm
+
+from travjax import report
+from travjax.commands import options
+from travjax.config import require
+from travjax.files import output_folder, written_whole
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser(
+        "bench", help="measure speed", description="Measures terrain and labelling on this machine."
+    )
+    options.add_robot(parser)
+    options.add_grid(parser)
+    parser.add_argument(
+        "--repeats", type=int, default=15, metavar="N", help="timed calls of which the median is taken (15)"
+    )
+    parser.add_argument(
+        "--stream", type=int, default=0, metavar="N", help="also make and label N maps (the paper has 56840)"
+    )
+    options.add_out(parser, "runs/bench")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, and writes the table as TSV and a figure."""
+    from travjax import bench, plots
+
+    grid, robot, actions = options.configuration(arguments)
+    bench.check(robot, actions, grid)
+    require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
+    require(arguments.stream >= 0, "--stream", arguments.stream, "at least 0")
+    out = output_folder(arguments.out)
+    rows = [bench.start_row()]
+    # First calls are to compile, not to read the cache.
+    jax.config.update("jax_enable_compilation_cache", False)
+    measured = bench.kernel_rows(robot, actions, grid, arguments.repeats)
+    rows += list(tqdm(measured, "kernels", total=2 * len(bench.BATCHES)))
+    with tqdm(desc="sequential simulator", total=len(actions), unit="trajectory") as bar:
+        rows.append(bench.reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
+    if arguments.stream:
+        with tqdm(desc="stream", total=arguments.stream, unit="map") as bar:
+            rows.append(bench.stream_row(arguments.stream, robot, actions, grid, bar.update))
+    rows = bench.with_speed_up(rows)
+    print(f"\n{bench.machine()}\n{report.rows_table(rows, bench.COLUMNS)}\n")
+    with written_whole(out / "bench.tsv") as temporary:
+        bench.write_tsv(rows, temporary)
+    print(out / "bench.tsv")
+    kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
+    print(plots.save(plots.speed_figure(kernels), out / "bench.png"))

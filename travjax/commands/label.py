@@ -1,0 +1,129 @@
+"""`travjax label`: every trajectory of synthetic or real maps with its failures."""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from travjax import report
+from travjax.actions import ActionSpace
+from travjax.commands import options
+from travjax.config import require
+from travjax.dem import load_dem
+from travjax.files import output_folder, save_npz, written_whole
+from travjax.grid import Grid
+from travjax.labelling import Batch, dem_batches, joined, labelled, samples, synthetic_batches, title
+from travjax.robot import Robot
+from travjax.terrain import STYLES
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser(
+        "label",
+        help="label every trajectory of synthetic or real maps",
+        description="Labels every trajectory of maps with step, obstacle and tilt failures: of synthetic maps, or of "
+        "the windows of elevation maps (GeoTIFF and other rasters, .npy, .npz).",
+    )
+    parser.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
+    options.add_synthetic(parser, count=200, each="maps in all, the styles in turn")
+    parser.add_argument("--stride", type=float, metavar="M", help="metres between windows of a DEM (8)")
+    parser.add_argument(
+        "--cell-size", type=float, metavar="M", help="metres between a DEM's values, if the file does not say"
+    )
+    parser.add_argument("--height-scale", type=float, metavar="M", help="metres per unit of a DEM's values (1)")
+    parser.add_argument(
+        "--nodata",
+        type=float,
+        metavar="Z",
+        help="value that marks unknown ground, if the file does not say; as in --nodata=-9999",
+    )
+    parser.add_argument(
+        "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m of known ground"
+    )
+    parser.add_argument("--allow-coarse", action="store_true", help="take DEM cells larger than 0.125 m")
+    options.add_robot(parser)
+    options.add_grid(parser)
+    parser.add_argument("--no-figures", action="store_true", help="write no figures")
+    options.add_out(parser, "runs/label")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Labels the maps, prints the shares that fail, and writes labels, shares and figures."""
+    grid, robot, actions = options.configuration(arguments)
+    total, source, files = _maps(arguments, grid)
+    out = output_folder(arguments.out)
+
+    batches = (labelled(batch, robot, actions, grid) for batch in source)
+    maps = joined(list(options.progress(batches, total, "labelling")))
+
+    as_in_paper = not arguments.dem and options.as_in_paper(robot, actions)
+    table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
+    config = options.configuration_json(robot, actions, grid, files=files)
+    labels = save_npz(out / "labels.npz", config=config, cell_size=grid.spacing, **maps)
+    with written_whole(out / "shares.txt") as temporary:
+        temporary.write_text(table + "\n")
+    print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+    unknown = int((~maps["known"].any(axis=-1)).sum())
+    if unknown:
+        print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
+    print(labels, out / "shares.txt", sep="\n")
+    if not arguments.no_figures:
+        _write_figures(maps, robot, actions, grid, out)
+
+
+def _maps(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
+    """The number of maps, batches of them, and how each DEM file was read."""
+    dem_options = ("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse")
+    unused = ("style", "count", "seed") if arguments.dem else dem_options
+    for name in unused:
+        given = getattr(arguments, name)
+        allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
+        require(given is None or given is False, f"--{name.replace('_', '-')}", given, allowed)
+    if arguments.dem:
+        return _dem_windows(arguments, grid)
+    styles, total, seed = arguments.style or list(STYLES), options.count(arguments), options.seed(arguments)
+    names = [styles[number % len(styles)] for number in range(total)]
+    return total, synthetic_batches(names, list(range(seed, seed + total)), grid), []
+
+
+def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
+    """The number of windows of all files, batches of them with where they come from, and how each file was read."""
+    settings: dict[str, Any] = {
+        "stride": 8.0 if arguments.stride is None else arguments.stride,
+        "cell_size": arguments.cell_size,
+        "height_scale": arguments.height_scale,
+        "nodata": arguments.nodata,
+        "fill_holes": not arguments.keep_holes,
+        "allow_coarse": arguments.allow_coarse,
+    }
+    names = [path.name for path in arguments.dem]
+    files, notes = [], []
+    for path in arguments.dem:
+        windows = load_dem(path, grid=grid, **settings)
+        crs = windows.crs or "none"
+        crs = crs.split('"')[1] if '"' in crs else crs  # of a system without a code, the name
+        print(
+            f"{path}: {len(windows.heights)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
+            f"crs {crs}, {windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
+        )
+        files.append((path.name if names.count(path.name) == 1 else str(path), windows))
+        read = {
+            name: getattr(windows, name)
+            for name in ("path", "sha256", "crs", "height_offset", "covered", "filled", "unknown")
+        }
+        notes.append(read | settings | {"cell_size": windows.cell_size})
+
+    return sum(len(windows.heights) for _, windows in files), dem_batches(files), notes
+
+
+def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, out: Path) -> None:
+    from travjax import plots  # matplotlib takes 0.3 s to import
+
+    chosen = samples(maps)
+    titles = [title(maps, index) for index in chosen]
+    heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
+    print(plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"))
+    print(plots.save(plots.robot_figure(robot), out / "robot.png"))
+    print(plots.save(plots.action_figure(actions, robot, grid), out / "actions.png"))

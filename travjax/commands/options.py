@@ -1,0 +1,97 @@
+"""What commands share: groups of options, the configurations they make, and progress."""
+
+import argparse
+import json
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from travjax.actions import ActionSpace
+from travjax.config import InputError, require, to_json
+from travjax.footprint import node_table
+from travjax.grid import Grid
+from travjax.labelling import Batch
+from travjax.robot import Robot
+from travjax.terrain import STYLES
+from travjax.traverse import default_robot
+
+Commands = argparse._SubParsersAction
+"""What `add(commands)` of a command adds its parser to."""
+
+
+def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> None:
+    """Styles, number and seed of synthetic maps; see `count` and `seed`."""
+    parser.add_argument(
+        "--style", nargs="+", choices=STYLES, metavar="STYLE", help=f"styles: {', '.join(STYLES)} (all)"
+    )
+    parser.add_argument("--count", type=int, metavar="N", help=f"number of {each} ({count})")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of the first map, counting on from there (0)")
+    parser.set_defaults(default_count=count)
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Robot and action space; see `configuration`."""
+    presets = ", ".join(Robot.presets())
+    parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
+    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
+
+
+def add_grid(parser: argparse.ArgumentParser) -> None:
+    """Size and spacing of maps; see `configuration`."""
+    parser.add_argument("--size", type=float, default=8.0, metavar="M", help="edge of a map in metres (8)")
+    parser.add_argument(
+        "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
+    )
+
+
+def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
+    """The folder to write to."""
+    parser.add_argument("--out", type=Path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})")
+
+
+def count(arguments: argparse.Namespace) -> int:
+    """The number of synthetic maps."""
+    count = arguments.default_count if arguments.count is None else arguments.count
+    require(count > 0, "--count", count, "at least 1")
+    return count
+
+
+def seed(arguments: argparse.Namespace) -> int:
+    """The seed of the first synthetic map."""
+    seed = arguments.seed or 0
+    require(0 <= seed < 2**31, "--seed", seed, f"from 0 to {2**31 - 1}")
+    return seed
+
+
+def configuration(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
+    """Grid, robot and action space; refuses what does not fit together before anything is made."""
+    grid, robot = Grid(arguments.size, arguments.spacing), Robot.load(arguments.robot)
+    actions = ActionSpace.load(arguments.actions) if arguments.actions else ActionSpace()
+    try:
+        node_table(robot, actions, grid)
+    except InputError as error:
+        given = [str(source) for source in (arguments.robot, arguments.actions) if source]
+        raise InputError(f"{' with '.join(given)}: {error}") from None
+    return grid, robot, actions
+
+
+def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
+    """Whether shares of synthetic maps compare with the paper's."""
+    return robot == default_robot() and actions == ActionSpace()
+
+
+def configuration_json(robot: Robot, actions: ActionSpace, grid: Grid, **more: Any) -> str:
+    """All that labels depend on, as JSON, with the version of travjax; a straight arc's radius is "inf"."""
+    parts = {name: to_json(part) for name, part in (("robot", robot), ("actions", actions), ("grid", grid))}
+    return json.dumps(parts | more | {"travjax": version("travjax")}, allow_nan=False)
+
+
+def progress(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]:
+    """The batches, with a bar that counts their maps."""
+    with tqdm(desc=what, total=total, unit="map") as bar:
+        for batch in batches:
+            yield batch
+            bar.update(len(batch["heights"]))

@@ -1,0 +1,43 @@
+"""`travjax terrain`: synthetic maps and pictures of them."""
+
+import argparse
+
+import numpy as np
+
+from travjax.commands import options
+from travjax.files import output_folder, save_npz
+from travjax.grid import Grid
+from travjax.labelling import joined, synthetic_batches
+from travjax.terrain import STYLES
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser("terrain", help="make synthetic maps", description="Makes synthetic maps.")
+    options.add_synthetic(parser, count=12, each="maps of each style")
+    options.add_grid(parser)
+    options.add_out(parser, "runs/terrain")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Makes maps of each style and writes them, and a contact sheet of each style."""
+    from travjax import plots  # matplotlib takes 0.3 s to import
+
+    grid = Grid(arguments.size, arguments.spacing)
+    styles = arguments.style or list(STYLES)
+    count, seed = options.count(arguments), options.seed(arguments)
+    out = output_folder(arguments.out)
+    names = [style for style in styles for _ in range(count)]
+    seeds = list(range(seed, seed + count)) * len(styles)
+    maps = joined(list(options.progress(synthetic_batches(names, seeds, grid), len(names), "terrain")))
+    print(save_npz(out / "terrain.npz", cell_size=grid.spacing, **maps))
+    for style in styles:
+        chosen = np.flatnonzero(maps["group"] == style)[:24]
+        titles = [f"seed {seed}" for seed in maps["seed"][chosen]]
+        print(
+            plots.save(
+                plots.contact_sheet(maps["heights"][chosen], titles, f"{style}: {len(chosen)} of {count} maps", grid),
+                out / f"terrain_{style}.png",
+            )
+        )

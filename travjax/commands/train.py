@@ -1,0 +1,140 @@
+"""`travjax train`: trains the estimator from a preset, and goes on with a run that was interrupted."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from tqdm import tqdm
+
+from travjax.commands import options
+from travjax.config import InputError, require
+from travjax.files import output_folder
+
+DATA = "data"
+"""Folder of a run's own data set."""
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser(
+        "train",
+        help="train the estimator",
+        description="Makes or reads a data set, trains the heads on the frozen trunk, then everything, and keeps "
+        "checkpoints, metrics.jsonl, TensorBoard files and a figure in one folder.",
+    )
+    parser.add_argument("preset", type=Path, metavar="PRESET", help=".toml file, as in experiments/train")
+    parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
+    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    options.add_grid(parser)
+    parser.add_argument(
+        "--data", type=Path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
+    )
+    parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
+    parser.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in --out")
+    options.add_out(parser, "runs/train/PRESET")
+    group = parser.add_argument_group("several processes that train together")
+    group.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
+    group.add_argument("--processes", type=int, metavar="N", help="how many there are")
+    group.add_argument("--process", type=int, metavar="I", help="which of them this is, from 0")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Trains."""
+    from travjax.parallel import Devices, join
+
+    shared = (arguments.coordinator, arguments.processes, arguments.process)
+    if any(value is not None for value in shared):
+        given = all(value is not None for value in shared)
+        require(given, "--coordinator, --processes, --process", shared, "all three or none")
+        join(*shared)
+    devices = Devices.all()
+    folder, wanted = _folder(arguments), _wanted(arguments)
+    _check_folder(folder, wanted, arguments.resume)
+    devices.wait()
+    _train(arguments, wanted, output_folder(folder), devices)
+
+
+def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None:
+    from travjax.estimator import create
+    from travjax.imagenet import load_weights
+    from travjax.preset import find_weights
+    from travjax.train import Trainer
+
+    preset = wanted.preset
+    weights = None
+    if not arguments.resume:
+        file = find_weights(preset.weights)
+        weights = load_weights(file, preset.trunk) if file else None
+    dataset = _dataset(arguments, wanted, folder, devices)
+    trainer = Trainer(wanted, dataset, folder, devices)
+    if arguments.resume:
+        trainer.resume()
+    else:
+        if devices.main:
+            wanted.save(folder)
+        trainer.start(create(preset.trunk, preset.heads, preset.training.seed, weights))
+    trainer.train()
+    if devices.main:
+        _finish(folder)
+
+
+def _wanted(arguments: argparse.Namespace):
+    """The run that is asked for."""
+    from travjax.preset import Preset
+    from travjax.trained import Run
+
+    preset = Preset.load(arguments.preset)
+    if arguments.weights:
+        preset = replace(preset, weights=arguments.weights)
+    if arguments.seed is not None:
+        seed = options.seed(arguments)
+        preset = replace(
+            preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
+        )
+    arguments.robot = arguments.robot or preset.robot
+    grid, robot, actions = options.configuration(arguments)
+    return Run(replace(preset, robot=arguments.robot), robot, actions, grid)
+
+
+def _folder(arguments: argparse.Namespace) -> Path:
+    return Path(*(arguments.preset.stem if part == "PRESET" else part for part in arguments.out.parts))
+
+
+def _check_folder(folder: Path, wanted, resume: bool) -> None:
+    """A run is neither overwritten nor continued with other settings."""
+    from travjax.trained import Run
+
+    exists = (folder / "run.json").exists()
+    if resume:
+        Run.load(folder).require_same(wanted, f"--resume {folder}")
+    elif exists:
+        raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
+
+
+def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
+    """The data set that is given, else the run's own, made if it is not there yet."""
+    from travjax import dataset
+    from travjax.commands.dataset import made
+
+    if arguments.data:
+        return dataset.load(arguments.data)
+    kept = folder / DATA
+    if devices.main and not (kept / "dataset.json").exists():
+        made(wanted.preset.dataset, wanted.robot, wanted.actions, wanted.grid, kept)
+    devices.wait()
+    return dataset.load(kept)
+
+
+def _finish(folder: Path) -> None:
+    """The figure of the run, and where everything is."""
+    from travjax import curves, plots
+    from travjax.runlog import read_rows
+
+    rows = folder / "metrics.jsonl"
+    tqdm.write("")
+    for path in (folder / "checkpoints", rows, folder / "tensorboard"):
+        print(path)
+    print(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))
+    print(f"\nNext: travjax evaluate {folder}")

@@ -1,0 +1,77 @@
+"""Evaluation of a trained estimator on the test maps of a data set (SPEC section 10)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from travjax import metrics
+from travjax.baselines import LogisticRegression, slope_and_step
+from travjax.dataset import Dataset, require_same
+from travjax.estimator import Estimator, take_apart
+from travjax.inputs import ImageSource, trajectory_bank
+from travjax.parallel import Devices
+from travjax.prediction import over_samples, probabilities, sample_logits
+from travjax.sampling import Samples, balanced_subset, every_sample, natural_sample
+from travjax.trained import Run
+from travjax.traverse import unpacked
+
+Progress = Callable[[int], object]
+
+REGRESSION_SAMPLES = 50_000
+"""Training samples that the logistic regression is fitted to, at most."""
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """A run's data set on the devices, ready for its estimators.
+
+    Raises InputError when the data set is not for the run's robot, action space and grid.
+    """
+
+    run: Run
+    dataset: Dataset
+    source: ImageSource
+    devices: Devices
+
+    @staticmethod
+    def of(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
+        """Puts the images' parts on the devices."""
+        require_same(dataset, run.robot, run.actions, run.grid)
+        bank = trajectory_bank(run.robot, run.actions, run.grid)
+        source = ImageSource(dataset.heights, bank, np.float32(run.preset.elevation_scale))
+        return Evaluator(run, dataset, devices.replicate(source), devices)
+
+    def samples(self, maps: int, each: int) -> Samples:
+        """Random test samples at natural frequency: of so many maps so many trajectories; 0 for all."""
+        labels, test = self.dataset.labels, self.dataset.maps_of("test")
+        if not maps and not each:
+            return every_sample(labels, test)
+        seed = self.run.preset.training.seed
+        return natural_sample(labels, test, seed, maps or len(test), each or labels.shape[1])
+
+    def failed(self, samples: Samples) -> np.ndarray:
+        """Failures of samples: [k, 3] bool."""
+        return np.asarray(unpacked(self.dataset.labels[samples])[0])
+
+    def probabilities(
+        self, estimator: Estimator, samples: Samples, on_progress: Progress = lambda count: None
+    ) -> np.ndarray:
+        """Of samples: [k, 3]."""
+        graph, variables = take_apart(estimator)
+        variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
+        logits = over_samples(sample_logits, graph, variables, self.source, samples, self.devices, size, on_progress)
+        return probabilities(logits)
+
+    def regression(self, samples: Samples) -> np.ndarray:
+        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""
+        config, run, heights = self.run.preset.training, self.run, self.dataset.heights
+        maps = self.dataset.maps_of("train")[: REGRESSION_SAMPLES // config.each]
+        known = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
+        features = [slope_and_step(heights, part, run.actions, run.grid) for part in (known, samples)]
+        return LogisticRegression.fit(features[0], self.failed(known)).probabilities(features[1])
+
+    def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
+        """All figures of predicted probabilities [k, 3], by style or site as well."""
+        groups = self.dataset.group[samples[0]]
+        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls)

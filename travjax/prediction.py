@@ -1,0 +1,71 @@
+"""The network on many samples, a batch after the other."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float
+
+from travjax.estimator import put_together
+from travjax.inputs import ImageSource
+from travjax.parallel import Devices
+from travjax.sampling import Samples
+
+Variables = dict[str, nnx.State]
+
+
+@partial(jax.jit, static_argnames="graph")
+def sample_logits(graph, variables: Variables, source: ImageSource, map_index, trajectory_index):
+    """Logits of samples [b]: [b, 3]."""
+    return put_together(graph, variables)(source.images(map_index, trajectory_index))
+
+
+@partial(jax.jit, static_argnames="graph")
+def sample_features(graph, variables: Variables, source: ImageSource, map_index, trajectory_index):
+    """The trunk's features of samples [b]: [b, features]."""
+    return put_together(graph, variables).trunk(source.images(map_index, trajectory_index))[0]
+
+
+@partial(jax.jit, static_argnames="graph")
+def feature_logits(graph, variables: Variables, features: Float[Array, "b f"]):
+    """Logits of features of the trunk: [b, 3]."""
+    return put_together(graph, variables).heads(features)
+
+
+def over_samples(
+    function: Callable[..., Float[Array, "b f"]],
+    graph: nnx.GraphDef,
+    variables: Variables,
+    source: ImageSource,
+    samples: Samples,
+    devices: Devices,
+    batch_size: int = 64,
+    on_progress: Callable[[int], object] = lambda count: None,
+) -> Float[np.ndarray, "k f"]:
+    """`sample_logits` or `sample_features` of k samples, on the host.
+
+    on_progress: is told how many samples were added
+    """
+    count = len(samples[0])
+    results: list[np.ndarray] = []
+    running: list[tuple[int, jax.Array]] = []
+
+    def collect(most: int) -> None:
+        while len(running) > most:
+            size, result = running.pop(0)
+            results.append(devices.fetch(result)[:size])
+            on_progress(size)
+
+    for start in range(0, count, batch_size):
+        batch = tuple(np.resize(index[start : start + batch_size], batch_size) for index in samples)
+        running.append((min(batch_size, count - start), function(graph, variables, source, *devices.shard(batch))))
+        collect(2)  # the device works while the host fetches
+    collect(0)
+    return np.concatenate(results)
+
+
+def probabilities(logits: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """The sigmoid of logits."""
+    return np.asarray(jax.nn.sigmoid(logits))

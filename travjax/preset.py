@@ -1,0 +1,141 @@
+"""Everything that a training run is made from, as one TOML file (experiments/train/*.toml)."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import optax
+
+from travjax.config import InputError, load_toml, require, require_number
+from travjax.dataset import DatasetConfig
+from travjax.estimator import HeadsConfig
+from travjax.resnet import ResNetConfig
+
+SCHEDULES = ("constant", "cosine")
+
+
+def _require_counts(config: object, *names: str, least: int) -> None:
+    for name in names:
+        value = getattr(config, name)
+        require(type(value) is int and value >= least, name, value, f"a whole number, at least {least}")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How the network is trained (SPEC section 9).
+
+    seed:                 of the subsets, their order, the heads' first values and dropout
+    batch_size:           samples a step
+    head_epochs:          phase 1: epochs of the heads on the features of the frozen trunk
+    epochs:               phase 2: epochs of everything
+    learning_rate, decay, epsilon: of RMSprop
+    schedule:             of phase 2: "constant", or "cosine" down to zero
+    warmup_steps:         steps of phase 2 over which the learning rate rises from zero
+    weight_decay:         times the sum of squares of the heads' kernels, added to the loss
+    each, failing:        trajectories a map in an epoch, and how many of them fail if as many do
+    fresh:                a new subset of trajectories each epoch instead of the same one (phase 2)
+    validation_samples:   at most this many of the validation maps' balanced subset
+    checkpoint_steps:     steps from one checkpoint to the next; there is one after each epoch as well
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    seed: int = 0
+    batch_size: int = 64
+    head_epochs: int = 1
+    epochs: int = 10
+    learning_rate: float = 1e-4
+    decay: float = 0.9
+    epsilon: float = 1e-7
+    schedule: str = "constant"
+    warmup_steps: int = 0
+    weight_decay: float = 0.001
+    each: int = 11
+    failing: int = 6
+    fresh: bool = False
+    validation_samples: int = 100_000
+    checkpoint_steps: int = 500
+
+    def __post_init__(self):
+        _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing", least=0)
+        _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
+        require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
+        require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
+        require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
+        require_number("epsilon", self.epsilon, 0, 1, "above 0 and at most 1")
+        require_number("weight_decay", self.weight_decay, -1e-300, 10, "from 0 to 10")
+        require(self.schedule in SCHEDULES, "schedule", self.schedule, f"one of {', '.join(SCHEDULES)}")
+        require(type(self.fresh) is bool, "fresh", self.fresh, "true or false")
+        require(self.head_epochs + self.epochs > 0, "epochs", self.epochs, "at least 1 where head_epochs is 0")
+
+    def schedule_of(self, phase: int, steps: int) -> optax.Schedule:
+        """The learning rate of each of the `steps` of a phase; it varies in phase 2 only."""
+        rate, warmup = self.learning_rate, self.warmup_steps
+        if phase == 1 or self.schedule == "constant" and not warmup:
+            return optax.constant_schedule(rate)
+        if self.schedule == "constant":
+            return optax.warmup_constant_schedule(0.0, rate, warmup)
+        return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, max(steps, warmup + 1))
+
+    def optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
+        """RMSprop for the `steps` of a phase."""
+        return optax.rmsprop(self.schedule_of(phase, steps), self.decay, self.epsilon, eps_in_sqrt=False)
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The sample of the test maps that is evaluated, at natural frequency.
+
+    maps: test maps; each: random trajectories of each map; 0 for all
+    """
+
+    maps: int = 0
+    each: int = 0
+
+    def __post_init__(self):
+        _require_counts(self, "maps", "each", least=0)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A training run.
+
+    robot:           a preset or a .toml file
+    weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones
+    elevation_scale: metres that count as 1 in the elevation channel
+
+    The rest are the tables of the file.
+    """
+
+    robot: str = "seekur_jr"
+    weights: str = "imagenet/resnet50_imagenet.npz"
+    elevation_scale: float = 1.0
+    dataset: DatasetConfig = DatasetConfig()
+    trunk: ResNetConfig = ResNetConfig()
+    heads: HeadsConfig = HeadsConfig()
+    training: TrainingConfig = TrainingConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    def __post_init__(self):
+        for name in ("robot", "weights"):
+            value = getattr(self, name)
+            require(isinstance(value, str) and bool(value), name, value, "a non-empty text")
+        require_number("elevation_scale", self.elevation_scale, 0, 1000, "a length in metres, above 0 and at most 1000")
+
+    @staticmethod
+    def load(path: str | Path) -> "Preset":
+        """Reads a preset from a TOML file; raises InputError when it is missing or wrong."""
+        return load_toml(path, Preset)
+
+
+def find_weights(name: str) -> Path | None:
+    """The file of a preset's `weights`, None for "none"; raises InputError when there is none."""
+    if name == "none":
+        return None
+    data = os.environ.get("TRAVJAX_DATA")
+    places = [Path(name)] + ([Path(data) / name] if data else [])
+    for place in places:
+        if place.is_file():
+            return place
+    where = f"nor under TRAVJAX_DATA={data}" if data else "and TRAVJAX_DATA is not set"
+    raise InputError(f"weights {name}: no such file here, {where}; allowed: --weights FILE, or none for random ones")

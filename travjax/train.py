@@ -1,0 +1,340 @@
+"""Training in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
+
+The state is a dict of pytrees: parameters of "trunk" and "heads", the trunk's running "statistics", and the "optimizer"
+state of what the phase trains. A step is one jitted function of state and batch. All that is random follows from the
+training seed and the step, so a run that was interrupted goes on as if it had not been.
+"""
+
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+from flax import nnx
+from tqdm import tqdm
+
+from travjax import metrics
+from travjax.checkpoint import Checkpoints
+from travjax.config import InputError, require
+from travjax.dataset import Dataset, require_same
+from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
+from travjax.inputs import ImageSource, trajectory_bank
+from travjax.parallel import Devices
+from travjax.prediction import feature_logits, over_samples, probabilities, sample_features, sample_logits
+from travjax.runlog import RunLog
+from travjax.sampling import Sampler, Samples, balanced_subset, batches, random_keys
+from travjax.trained import TRAINED, Run
+from travjax.traverse import EVENTS, unpacked
+
+State = dict[str, Any]
+
+IN_FLIGHT = 2
+"""Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
+
+REPORTS = 20
+"""Rows of the training loss in an epoch."""
+
+
+@dataclass
+class Position:
+    """Where training stands; with the state, all that is needed to go on.
+
+    phase: 1 or 2; epoch: of the phase; step: of the epoch; total: steps in all
+    loss, samples: sums over the epoch so far; best: largest overall average precision of a validation so far
+    """
+
+    phase: int = 1
+    epoch: int = 0
+    step: int = 0
+    total: int = 0
+    loss: float = 0.0
+    samples: float = 0.0
+    best: float = -1.0
+
+
+def _heads_alone(estimator: Estimator, features, key):
+    return estimator.heads(features, key)
+
+
+def _everything(estimator: Estimator, inputs, key):
+    source, map_index, trajectory_index = inputs
+    return estimator(source.images(map_index, trajectory_index), train=True, key=key)
+
+
+FORWARD = {1: _heads_alone, 2: _everything}
+"""The logits of a training step of each phase."""
+
+
+@partial(jax.jit, static_argnames=("graph", "phase", "optimizer", "weight_decay"), donate_argnames="state")
+def update(state: State, inputs, failed, weight, seed, step, *, graph, phase: int, optimizer, weight_decay: float):
+    """One step of a phase: the new state, and the mean over the batch of the cross-entropy summed over the events.
+
+    inputs: what FORWARD takes; failed: [b, 3]; weight: [b], 0 for a sample that only fills the batch up
+    """
+
+    key = jax.random.fold_in(jax.random.key(seed), step)
+
+    def loss(parameters):
+        estimator = put_together(graph, state | parameters)
+        logits = FORWARD[phase](estimator, inputs, key)
+        entropy = optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1)
+        entropy = (entropy * weight).sum() / weight.sum()
+        penalty = weight_decay * estimator.heads.squares()
+        return entropy + penalty, (entropy, nnx.state(estimator, nnx.BatchStat))
+
+    parameters = {name: state[name] for name in TRAINED[phase]}
+    gradients, (entropy, statistics) = jax.grad(loss, has_aux=True)(parameters)
+    updates, moved = optimizer.update(gradients, state["optimizer"], parameters)
+    return state | optax.apply_updates(parameters, updates) | {"statistics": statistics, "optimizer": moved}, entropy
+
+
+class Trainer:
+    """One training run.
+
+    state: see the module; position: where it stands
+    Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
+    validation samples, or when the devices cannot share a batch.
+    """
+
+    def __init__(self, run: Run, dataset: Dataset, folder: Path, devices: Devices, quiet: bool = False):
+        require_same(dataset, run.robot, run.actions, run.grid)
+        devices.check_batch(run.preset.training.batch_size)
+        self.run, self.dataset, self.folder, self.devices = run, dataset, folder, devices
+        self.config = run.preset.training
+        self.quiet = quiet or not devices.main
+        self.checkpoints = Checkpoints(folder / "checkpoints")
+        self.position = Position()
+        self._optimizers: dict[int, optax.GradientTransformation] = {}
+        self.graph = run.graph()
+        for split, samples in (("train", self.samples(1, 0)), ("validation", self.validation)):
+            require(len(samples[0]) > 0, f"data set, {split} split", 0, "at least one known trajectory")
+
+    # What is trained on
+
+    @cached_property
+    def _sampler(self) -> Sampler:
+        config, maps = self.config, self.dataset.maps_of("train")
+        return Sampler(self.dataset.labels, maps, config.seed, config.each, config.failing, config.fresh)
+
+    def samples(self, phase: int, epoch: int) -> Samples:
+        """Training samples of an epoch; phase 1 has the same ones in all."""
+        return self._sampler.epoch(0 if phase == 1 else epoch + 1)
+
+    @cached_property
+    def validation(self) -> Samples:
+        """The balanced subset of the validation maps, or as many of it as the configuration allows."""
+        config, maps = self.config, self.dataset.maps_of("validation")
+        samples = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
+        keys = random_keys(("validation", config.seed), np.arange(len(samples[0])))
+        chosen = np.sort(np.argsort(keys)[: config.validation_samples])
+        return samples[0][chosen], samples[1][chosen]
+
+    @cached_property
+    def source(self) -> ImageSource:
+        """Images of all samples, on the devices."""
+        run = self.run
+        with self._bar("trajectory bank", len(run.actions), "trajectory") as bar:
+            bank = trajectory_bank(run.robot, run.actions, run.grid, on_progress=bar.update)
+        return self.devices.replicate(ImageSource(self.dataset.heights, bank, np.float32(run.preset.elevation_scale)))
+
+    @cached_property
+    def _features(self) -> dict[str, np.ndarray]:
+        """The frozen trunk's features of the samples of phase 1, computed once."""
+        samples = {"training": self.samples(1, 0), "validation": self.validation}
+        return {name: self._over(sample_features, part, f"{name} features") for name, part in samples.items()}
+
+    def _batches(self, phase: int, epoch: int) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
+        """Inputs, failures [b, 3] and weights [b] of the steps of an epoch, on the host."""
+        samples, order = self.samples(phase, epoch), np.arange(len(self.samples(phase, epoch)[0]))
+        failed = _failed(self.dataset, samples)
+        stream = 2 * epoch + phase - 1  # another order in each epoch of each phase
+        for index, _, weight in zip(
+            *batches((order, order), self.config.batch_size, self.config.seed, stream), strict=True
+        ):
+            inputs = self._features["training"][index] if phase == 1 else (samples[0][index], samples[1][index])
+            yield inputs, failed[index], weight
+
+    def _steps(self, phase: int, epoch: int) -> int:
+        return -(-len(self.samples(phase, epoch)[0]) // self.config.batch_size)
+
+    # The run
+
+    def start(self, estimator: Estimator) -> None:
+        """Begins with an estimator, whose trunk phase 1 leaves as it is."""
+        self.state: State = self.devices.replicate(take_apart(estimator)[1])
+        self._begin(1 if self.config.head_epochs else 2)
+        self._open_log()
+
+    def resume(self) -> None:
+        """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
+
+        Raises InputError when there is none.
+        """
+        template = lambda meta: self.run.template(meta["optimizer"], self.devices.everywhere)
+        self.state, meta = self.checkpoints.restore(template)
+        self.position = Position(**meta["position"])
+        for notice in self.checkpoints.notices:
+            self._say(notice)
+        self._open_log()
+
+    def train(self) -> None:
+        """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
+
+        Raises InputError when the loss is no number any more; the last checkpoint is kept.
+        """
+        while self.position.phase == 1:
+            if self.position.epoch == self.config.head_epochs:
+                variables = {name: self.state[name] for name in VARIABLES}
+                self.checkpoints.save_named("heads", variables, self._meta(optimizer=0))
+                self._begin(2)
+            else:
+                self._train_epoch()
+        while self.position.epoch < self.config.epochs:
+            self._train_epoch()
+        if self.log:
+            self.log.close()
+
+    def _begin(self, phase: int) -> None:
+        """A new optimizer, for what the phase trains."""
+        self.position.phase, self.position.epoch = phase, 0
+        trained = {name: self.state[name] for name in TRAINED[phase]}
+        optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
+        self.state = {name: self.state[name] for name in VARIABLES} | {"optimizer": optimizer}
+
+    def _optimizer(self, phase: int) -> optax.GradientTransformation:
+        if phase not in self._optimizers:  # the same object each time: jit compiles for it
+            steps = self._steps(phase, 0) * (self.config.head_epochs, self.config.epochs)[phase - 1]
+            self._optimizers[phase] = self.config.optimizer(phase, steps)
+        return self._optimizers[phase]
+
+    def _train_epoch(self) -> None:
+        """From the present step to the end of the epoch, its validation and its checkpoint."""
+        here, size = self.position, self.config.batch_size
+        steps, count = self._steps(here.phase, here.epoch), len(self.samples(here.phase, here.epoch)[0])
+        if here.phase == 1:
+            self._features  # noqa: B018, computed before time is taken
+        began, before = time.perf_counter(), here.samples
+        running: deque[tuple[jax.Array, float]] = deque()
+        with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=here.step * size) as bar:
+            for batch in itertools.islice(self._batches(here.phase, here.epoch), here.step, None):
+                running.append((self._step(*batch), float(batch[2].sum())))
+                here.step, here.total = here.step + 1, here.total + 1
+                saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
+                while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
+                    self._count(*running.popleft(), here.step - len(running), bar)
+                if here.step % max(steps // REPORTS, 1) == 0 and here.step < steps:
+                    rate = (here.samples - before) / (time.perf_counter() - began)
+                    self._report({"loss": here.loss / max(here.samples, 1), "samples_per_s": rate})
+                if saves:
+                    self.checkpoints.save(here.total, self.state, self._meta(here.phase))
+        self._finish_epoch((here.samples - before) / (time.perf_counter() - began))
+
+    def _step(self, inputs, failed, weight) -> jax.Array:
+        phase = self.position.phase
+        inputs, failed, weight = self.devices.shard((inputs, failed, weight))
+        self.state, loss = update(
+            self.state,
+            inputs if phase == 1 else (self.source, *inputs),
+            failed,
+            weight,
+            self.config.seed,
+            self.position.total,
+            graph=self.graph,
+            phase=phase,
+            optimizer=self._optimizer(phase),
+            weight_decay=self.config.weight_decay,
+        )
+        return loss
+
+    def _count(self, loss: jax.Array, samples: float, number: int, bar: tqdm) -> None:
+        """Adds a batch to the epoch's sums."""
+        here, value = self.position, float(loss)
+        if not math.isfinite(value):
+            where = f"batch {number} of phase {here.phase}, epoch {here.epoch + 1}"
+            raise InputError(
+                f"loss = {value} in {where}: training stopped; the last checkpoint is kept, try a lower learning_rate"
+            )
+        here.loss, here.samples = here.loss + value * samples, here.samples + samples
+        bar.set_postfix(loss=f"{here.loss / here.samples:.3f}", refresh=False)
+        bar.update(int(samples))
+
+    def _finish_epoch(self, rate: float) -> None:
+        here = self.position
+        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated()}
+        overall = row["average_precision"]["overall"] or 0.0
+        best, here.best = overall > here.best, max(here.best, overall)
+        self._report(row)
+        self._say(_summary(here, row, best))
+        here.epoch, here.step, here.loss, here.samples = here.epoch + 1, 0, 0.0, 0.0
+        self.checkpoints.save(here.total, self.state, self._meta(here.phase) | {"validation": row}, best)
+
+    def _validated(self) -> dict[str, Any]:
+        """Loss, that of the best constant predictor, average precision and F1 on the validation samples."""
+        variables = {name: self.state[name] for name in VARIABLES}
+        if self.position.phase == 1:
+            features = self.devices.replicate(self._features["validation"])
+            logits = self.devices.fetch(feature_logits(self.graph, variables, features))
+        else:
+            logits = self._over(sample_logits, self.validation, "validation")
+        failed = _failed(self.dataset, self.validation)
+        share = failed.mean(axis=0, dtype=np.float64)
+        constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
+        scores = metrics.evaluate(probabilities(logits), failed.astype(bool))
+        return {
+            "validation_loss": float(optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1).mean()),
+            "constant_loss": constant,
+            "average_precision": metrics.to_json(scores.average_precision),
+            "f1": metrics.to_json(scores.f1),
+        }
+
+    # Small things
+
+    def _over(self, function, samples: Samples, what: str) -> np.ndarray:
+        variables = {name: self.state[name] for name in VARIABLES}
+        with self._bar(what, len(samples[0])) as bar:
+            size = self.config.batch_size
+            return over_samples(function, self.graph, variables, self.source, samples, self.devices, size, bar.update)
+
+    def _meta(self, optimizer: int) -> dict[str, Any]:
+        """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
+        return {"position": asdict(self.position), "optimizer": optimizer}
+
+    def _open_log(self) -> None:
+        self.log = RunLog(self.folder, self.position.total) if self.devices.main else None
+
+    def _report(self, row: dict[str, Any]) -> None:
+        here = self.position
+        schedule = self.config.schedule_of(here.phase, self._steps(here.phase, 0) * self.config.epochs)
+        rate = float(schedule(here.epoch * self._steps(here.phase, here.epoch) + here.step))
+        place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
+        if self.log:
+            self.log.write(place | row)
+
+    def _bar(self, what: str, total: int, unit: str = "sample", initial: int = 0) -> tqdm:
+        return tqdm(desc=what, total=total, initial=initial, unit=unit, disable=self.quiet, leave=False)
+
+    def _say(self, text: str) -> None:
+        if not self.quiet:
+            tqdm.write(text)
+
+
+def _failed(dataset: Dataset, samples: Samples) -> np.ndarray:
+    """Failures of samples: [k, 3] float32."""
+    return np.asarray(unpacked(dataset.labels[samples])[0], np.float32)
+
+
+def _summary(here: Position, row: dict[str, Any], best: bool) -> str:
+    shown = lambda value: "-" if value is None else f"{value:.3f}"
+    precision = ", ".join(f"{event} {shown(row['average_precision'][event])}" for event in EVENTS)
+    losses = f"loss {row['loss']:.3f}, validation {row['validation_loss']:.3f} (constant {row['constant_loss']:.3f})"
+    rate = f"{row['samples_per_s']:.0f} samples/s"
+    star = ", best so far" if best else ""
+    return f"phase {here.phase}, epoch {here.epoch + 1}: {losses}; average precision: {precision}; {rate}{star}"
