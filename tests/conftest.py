@@ -5,6 +5,8 @@ Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -133,17 +135,23 @@ def setting(request) -> Setting:
     return SETTINGS[request.param]
 
 
-@pytest.fixture(scope="module")
-def compilation_cache(tmp_path_factory) -> Path:
-    """Keeps code that commands compile away from the user's own cache, and JAX as it was for other tests."""
+@contextmanager
+def cache_in(folder: Path) -> Iterator[Path]:
+    """Commands keep compiled code in the folder; JAX is as it was for other tests afterwards."""
     settings = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
     before = {name: getattr(jax.config, name) for name in (*settings, "jax_compilation_cache_dir")}
     with pytest.MonkeyPatch.context() as patch:
-        folder = tmp_path_factory.mktemp("cache")
         patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
         yield folder
     for name, value in before.items():
         jax.config.update(name, value)
+
+
+@pytest.fixture(scope="module")
+def compilation_cache(tmp_path_factory) -> Path:
+    """Keeps code that commands compile away from the user's own cache, and JAX as it was for other tests."""
+    with cache_in(tmp_path_factory.mktemp("cache")) as folder:
+        yield folder
 
 
 @pytest.fixture(scope="session")
@@ -152,3 +160,34 @@ def few(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("actions") / "few.toml"
     path.write_text(FEW_TOML)
     return path
+
+
+@pytest.fixture(scope="session")
+def shared_code() -> Iterator[None]:
+    """Trainers of the same settings of the optimizer share compiled code."""
+    from travjax.preset import TrainingConfig
+
+    make, made = TrainingConfig.optimizer, {}
+
+    def optimizer(config, phase, steps):
+        steps = steps if config.schedule == "cosine" else 1
+        names = ("learning_rate", "decay", "epsilon", "schedule", "warmup_steps")
+        key = (phase, steps, *(getattr(config, name) for name in names))
+        return made.setdefault(key, make(config, phase, steps))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TrainingConfig, "optimizer", optimizer)
+        yield
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory, few, shared_code) -> Path:
+    """The folder of a finished run of `travjax train`; beside it are `set`, `tiny.toml`, `out.txt` and `err.txt`."""
+    from training import files_of_run, train, words_of
+
+    folder = tmp_path_factory.mktemp("trained")
+    with cache_in(folder / "cache"):
+        out, err = train((*words_of(files_of_run(folder), few), "--out", folder / "run"))
+    (folder / "out.txt").write_text(out)
+    (folder / "err.txt").write_text(err)
+    return folder / "run"

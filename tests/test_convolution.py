@@ -119,6 +119,13 @@ def test_any_convolution_and_its_gradients_agree_with_the_definition(drawn):
     assert_close(found, wanted, 1e-13)
 
 
+@pytest.mark.parametrize(("size", "padding"), [(1, 1), (2, 0), (3, 0), (3, 2), (3, 4)])
+def test_square_kernels_of_other_paddings_agree_with_the_definition(size, padding):
+    arrays = random(2, 6, 5, 2), random(size, size, 2, 3, seed=1)
+    wanted = exactly(lambda x, k: plain_convolution(x, k, 1, padding), *arrays)
+    assert_close(exactly(lambda x, k: convolve(x, k, 1, padding), *arrays), wanted, 1e-13)
+
+
 @pytest.mark.parametrize(("size", "stride"), [(1, 2), (3, 1), (3, 2)])
 def test_gradients_of_convolutions_are_differences_of_their_values(size, stride):
     arrays = random(2, 6, 5, 2), random(size, size, 2, 3, seed=1)

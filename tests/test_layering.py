@@ -45,6 +45,7 @@ ORDER = [
     "report",
     "statistics",
     "bench",
+    "bench_network",
     "commands.options",
     "commands.terrain",
     "commands.label",

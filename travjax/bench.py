@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import jax
@@ -112,10 +112,10 @@ def with_speed_up(rows: list[dict]) -> list[dict]:
     return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
 
 
-def write_tsv(rows: list[dict], path: Path) -> None:
-    """One line for each row, the keys of COLUMNS and `machine` as header."""
-    cells = [[*("" if row[key] is None else str(row[key]) for key in COLUMNS), machine()] for row in rows]
-    path.write_text("\n".join("\t".join(line) for line in [[*COLUMNS, "machine"], *cells]) + "\n")
+def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
+    """One line for each row, the keys in `columns` and `machine` as header."""
+    cells = [[*("" if row[key] is None else str(row[key]) for key in columns), machine()] for row in rows]
+    path.write_text("\n".join("\t".join(line) for line in [[*columns, "machine"], *cells]) + "\n")
 
 
 def _mixture(first: int, count: int) -> tuple[list[str], range]:

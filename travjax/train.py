@@ -230,9 +230,9 @@ class Trainer:
                 saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
                 while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
                     self._count(*running.popleft(), here.step - len(running), bar)
-                if here.step % max(steps // REPORTS, 1) == 0 and here.step < steps:
+                if here.samples and here.step % max(steps // REPORTS, 1) == 0 and here.step < steps:
                     rate = (here.samples - before) / (time.perf_counter() - began)
-                    self._report({"loss": here.loss / max(here.samples, 1), "samples_per_s": rate})
+                    self._report({"loss": here.loss / here.samples, "samples_per_s": rate})
                 if saves:
                     self.checkpoints.save(here.total, self.state, self._meta(here.phase))
         self._finish_epoch((here.samples - before) / (time.perf_counter() - began))
@@ -296,6 +296,20 @@ class Trainer:
         }
 
     # Small things
+
+    def summary(self) -> str:
+        """One line: what is trained on what."""
+        run, samples = self.run, self.samples(2, 0)
+        share = _failed(self.dataset, samples).any(axis=1).mean()
+        parts = (
+            f"{run.robot.name}, {len(run.actions)} trajectories a map",
+            f"{len(self.dataset.maps_of('train'))} training maps",
+            f"{len(samples[0])} samples an epoch, {share:.0%} of which fail",
+            f"{len(self.validation[0])} validation samples",
+            f"first weights: {run.preset.weights}",
+            f"devices: {self.devices.mesh.size} x {jax.devices()[0].device_kind}",
+        )
+        return "; ".join(parts)
 
     def _over(self, function, samples: Samples, what: str) -> np.ndarray:
         variables = {name: self.state[name] for name in VARIABLES}

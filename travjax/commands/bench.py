@@ -1,20 +1,24 @@
-"""`travjax bench`: how fast terrain and labelling are on this machine."""
+"""`travjax bench`: how fast terrain, labelling and the network are on this machine."""
 
 import argparse
+from pathlib import Path
 
 import jax
 from tqdm import tqdm
 
 from travjax import report
+from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import require
 from travjax.files import output_folder, written_whole
+from travjax.grid import Grid
+from travjax.robot import Robot
 
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
     parser = commands.add_parser(
-        "bench", help="measure speed", description="Measures terrain and labelling on this machine."
+        "bench", help="measure speed", description="Measures terrain and labelling on this machine, or the network."
     )
     options.add_robot(parser)
     options.add_grid(parser)
@@ -24,17 +28,46 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--stream", type=int, default=0, metavar="N", help="also make and label N maps (the paper has 56840)"
     )
+    parser.add_argument(
+        "--network", action="store_true", help="measure the network instead: inputs, a training step, a whole map"
+    )
     options.add_out(parser, "runs/bench")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and writes the table as TSV and a figure."""
+    grid, robot, actions = options.configuration(arguments)
+    require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
+    if arguments.network:
+        _measure_network(arguments, robot, actions, grid)
+    else:
+        _measure_labelling(arguments, robot, actions, grid)
+
+
+def _measure_network(arguments: argparse.Namespace, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+    from travjax import bench_network
+
+    out = output_folder(arguments.out)
+    rows = bench_network.Bench(robot, actions, grid, arguments.repeats).rows()
+    measured = bench_network.with_ratio(list(tqdm(rows, "network", total=4)))
+    _write(measured, bench_network.COLUMNS, out / "network.tsv")
+
+
+def _write(rows: list[dict], columns: dict[str, str], path: Path) -> None:
+    """Prints the table and writes it."""
+    from travjax import bench
+
+    print(f"\n{bench.machine()}\n{report.rows_table(rows, columns)}\n")
+    with written_whole(path) as temporary:
+        bench.write_tsv(rows, temporary, columns)
+    print(path)
+
+
+def _measure_labelling(arguments: argparse.Namespace, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
     from travjax import bench, plots
 
-    grid, robot, actions = options.configuration(arguments)
     bench.check(robot, actions, grid)
-    require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.stream >= 0, "--stream", arguments.stream, "at least 0")
     out = output_folder(arguments.out)
     rows = [bench.start_row()]
@@ -48,9 +81,6 @@ def run(arguments: argparse.Namespace) -> None:
         with tqdm(desc="stream", total=arguments.stream, unit="map") as bar:
             rows.append(bench.stream_row(arguments.stream, robot, actions, grid, bar.update))
     rows = bench.with_speed_up(rows)
-    print(f"\n{bench.machine()}\n{report.rows_table(rows, bench.COLUMNS)}\n")
-    with written_whole(out / "bench.tsv") as temporary:
-        bench.write_tsv(rows, temporary)
-    print(out / "bench.tsv")
+    _write(rows, bench.COLUMNS, out / "bench.tsv")
     kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
     print(plots.save(plots.speed_figure(kernels), out / "bench.png"))

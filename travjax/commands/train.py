@@ -31,7 +31,9 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
-    parser.add_argument("--resume", action="store_true", help="go on from the latest checkpoint in --out")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on from the latest checkpoint in --out, if there is one"
+    )
     options.add_out(parser, "runs/train/PRESET")
     group = parser.add_argument_group("several processes that train together")
     group.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
@@ -63,18 +65,19 @@ def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None
     from travjax.train import Trainer
 
     preset = wanted.preset
-    weights = None
-    if not arguments.resume:
-        file = find_weights(preset.weights)
-        weights = load_weights(file, preset.trunk) if file else None
-    dataset = _dataset(arguments, wanted, folder, devices)
-    trainer = Trainer(wanted, dataset, folder, devices)
-    if arguments.resume:
+    resumes = arguments.resume and _has_checkpoints(folder)
+    file = None if resumes else find_weights(preset.weights)
+    weights = load_weights(file, preset.trunk) if file else None
+    trainer = Trainer(wanted, _dataset(arguments, wanted, folder, devices), folder, devices)
+    if devices.main:
+        wanted.save(folder)
+        print(trainer.summary())
+    if resumes:
         trainer.resume()
     else:
-        if devices.main:
-            wanted.save(folder)
         trainer.start(create(preset.trunk, preset.heads, preset.training.seed, weights))
+        if devices.main:
+            print(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:
         _finish(folder)
@@ -106,11 +109,16 @@ def _check_folder(folder: Path, wanted, resume: bool) -> None:
     """A run is neither overwritten nor continued with other settings."""
     from travjax.trained import Run
 
-    exists = (folder / "run.json").exists()
-    if resume:
-        Run.load(folder).require_same(wanted, f"--resume {folder}")
-    elif exists:
+    if not _has_checkpoints(folder):
+        return
+    if not resume:
         raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
+    Run.load(folder).require_same(wanted, f"--resume {folder}")
+
+
+def _has_checkpoints(folder: Path) -> bool:
+    checkpoints = folder / "checkpoints"
+    return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
 def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
@@ -125,6 +133,21 @@ def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
         made(wanted.preset.dataset, wanted.robot, wanted.actions, wanted.grid, kept)
     devices.wait()
     return dataset.load(kept)
+
+
+def _draw_inputs(trainer, folder: Path) -> Path:
+    """The three channels of a few training samples."""
+    import numpy as np
+
+    from travjax import curves, plots
+
+    samples = trainer.samples(2, 0)
+    chosen = np.linspace(0, len(samples[0]) - 1, 4).astype(int)
+    maps, trajectories = (index[chosen] for index in samples)
+    images = np.asarray(trainer.source.images(maps, trajectories))
+    groups = trainer.dataset.group[maps]
+    titles = [f"{group}, trajectory {index}" for group, index in zip(groups, trajectories, strict=True)]
+    return plots.save(curves.input_channels_figure(images, titles, trainer.run.grid), folder / "inputs.png")
 
 
 def _finish(folder: Path) -> None:

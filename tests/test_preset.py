@@ -1,0 +1,206 @@
+"""Presets: what a TOML file gives, the one line for each wrong key or value, schedules and RMSprop."""
+
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from training import PRESET, TOML
+
+from travjax.config import InputError, from_json, to_json
+from travjax.dataset import DatasetConfig
+from travjax.estimator import HeadsConfig
+from travjax.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
+from travjax.resnet import ResNetConfig
+
+EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments/train").glob("*.toml"))
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "preset.toml"
+    path.write_text(text)
+    return path
+
+
+def refusal(path: Path) -> str:
+    with pytest.raises(InputError) as raised:
+        Preset.load(path)
+    message = str(raised.value)
+    assert message.startswith(f"{path}: ") and "\n" not in message
+    return message.removeprefix(f"{path}: ")
+
+
+# ---- Files
+
+
+def test_a_file_gives_every_table_by_name(tmp_path):
+    assert Preset.load(written(tmp_path, TOML)) == PRESET
+
+
+def test_what_is_left_out_is_the_paper(tmp_path):
+    preset = Preset.load(written(tmp_path, ""))
+    assert preset == Preset()
+    assert preset.dataset == DatasetConfig(56_840, 0, 0.08, 0.02)
+    assert preset.trunk == ResNetConfig((3, 4, 6, 3), 64, "1x1", momentum=0.99)
+    assert preset.heads == HeadsConfig(512, 0.2)
+    training = preset.training
+    assert (training.batch_size, training.head_epochs, training.epochs) == (64, 1, 10)
+    assert (training.learning_rate, training.decay, training.epsilon) == (1e-4, 0.9, 1e-7)
+    assert (training.weight_decay, training.each, training.failing) == (0.001, 11, 6)
+    assert (training.schedule, training.fresh) == ("constant", False)
+    assert preset.evaluation == EvaluationConfig(0, 0)
+
+
+def test_a_preset_comes_back_from_json():
+    assert from_json(to_json(PRESET), Preset) == PRESET
+
+
+@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
+def test_the_presets_of_the_repository_are_right(path):
+    preset = Preset.load(path)
+    steps = preset.dataset.maps * preset.training.each * preset.training.epochs / preset.training.batch_size
+    assert preset.trunk.momentum == (0.99 if steps > 1000 else 0.9)  # SPEC section 9
+    assert preset.trunk.features == 2048
+
+
+def test_there_is_a_preset_of_the_paper():
+    paper = Preset.load(next(path for path in EXPERIMENTS if path.stem == "paper"))
+    assert replace(paper.training, checkpoint_steps=1) == TrainingConfig(checkpoint_steps=1)
+    assert replace(paper.trunk, dtype="float32") == ResNetConfig()
+    assert (paper.dataset, paper.heads, paper.evaluation) == (DatasetConfig(), HeadsConfig(), EvaluationConfig())
+
+
+# ---- What is wrong with a file
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("maps = 3", "unknown key 'maps'; allowed: robot, weights, elevation_scale, dataset, trunk, heads, training"),
+        ("[dataset]\nmap = 3", "[dataset] unknown key 'map'; allowed: maps, seed, validation, test"),
+        ("[training]\nlearning_rates = 3", "[training] unknown key 'learning_rates'; allowed: seed, batch_size, "),
+        ("[evaluations]\nmaps = 3", "unknown key 'evaluations'; allowed: "),
+        ("[trunk]\nwidth_deg = 3", "[trunk] unknown key 'width_deg'; allowed: blocks, width"),
+        ("training = 3", "training = 3: must be a table [training]"),
+        ("[[training]]\nseed = 3", "training = [{'seed': 3}]: must be a table [training]"),
+        ("robot = 3", "robot = 3: must be a non-empty text"),
+        ('weights = ""', "weights = '': must be a non-empty text"),
+        ("elevation_scale = 0", "elevation_scale = 0: must be a length in metres, above 0 and at most 1000"),
+        ("[dataset]\nmaps = 0", "[dataset] maps = 0: must be a whole number from 1 to 10000000"),
+        ("[trunk]\nblocks = 3", "[trunk] blocks = 3: must be 1 to 8 whole numbers from 1 to 26"),
+        ("[heads]\nhidden = 0", "[heads] hidden = 0: must be a number from 1 to 65536"),
+        ("[evaluation]\neach = -1", "[evaluation] each = -1: must be a whole number, at least 0"),
+        ("[training]\nbatch_size = 0", "[training] batch_size = 0: must be a whole number, at least 1"),
+        ("[training]\nbatch_size = 8.0", "[training] batch_size = 8.0: must be a whole number, at least 1"),
+        ("[training]\nseed = -1", "[training] seed = -1: must be a whole number, at least 0"),
+        ("[training]\nseed = true", "[training] seed = True: must be a whole number, at least 0"),
+        ("[training]\neach = 2", "[training] failing = 6: must be at most each = 2"),
+        ("[training]\nlearning_rate = nan", "[training] learning_rate = nan: must be above 0 and at most 10"),
+        ("[training]\ndecay = 0", "[training] decay = 0: must be above 0 and at most 1"),
+        ("[training]\nepsilon = -1", "[training] epsilon = -1: must be above 0 and at most 1"),
+        ("[training]\nweight_decay = -0.1", "[training] weight_decay = -0.1: must be from 0 to 10"),
+        ('[training]\nschedule = "step"', "[training] schedule = 'step': must be one of constant, cosine"),
+        ("[training]\nfresh = 1", "[training] fresh = 1: must be true or false"),
+        ("[training]\nepochs = 0\nhead_epochs = 0", "[training] epochs = 0: must be at least 1 where head_epochs is 0"),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_line(tmp_path, text, message):
+    assert refusal(written(tmp_path, text)).startswith(message)
+
+
+def test_no_weight_decay_is_allowed():
+    assert TrainingConfig(weight_decay=0).weight_decay == 0
+
+
+def test_a_missing_file_is_named(tmp_path):
+    assert refusal(tmp_path / "none.toml") == "cannot be read: No such file or directory"
+
+
+# ---- Schedules and the optimizer
+
+
+def rates(phase: int = 2, steps: int = 20, **settings) -> np.ndarray:
+    schedule = TrainingConfig(learning_rate=0.5, **settings).schedule_of(phase, steps)
+    return np.array([float(schedule(step)) for step in range(steps + 1)])
+
+
+def test_a_constant_rate_is_constant():
+    np.testing.assert_allclose(rates(), 0.5)
+
+
+def test_a_constant_rate_is_warmed_up_in_a_straight_line():
+    np.testing.assert_allclose(rates(warmup_steps=5), 0.5 * np.minimum(np.arange(21) / 5, 1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("warmup", [0, 4])
+def test_a_cosine_falls_from_the_rate_to_zero(warmup):
+    step = np.arange(21)
+    falling = 0.25 * (1 + np.cos(np.pi * (step - warmup) / (20 - warmup)))
+    wanted = np.where(step < warmup, 0.5 * step / max(warmup, 1), falling)
+    np.testing.assert_allclose(rates(schedule="cosine", warmup_steps=warmup), wanted, atol=1e-6)
+
+
+def test_a_warmup_may_be_longer_than_the_run():
+    assert np.isfinite(rates(schedule="cosine", warmup_steps=30)).all()
+
+
+def test_the_heads_alone_are_trained_at_the_same_rate_throughout():
+    np.testing.assert_allclose(rates(phase=1, schedule="cosine", warmup_steps=5), 0.5)
+
+
+def test_the_optimizer_is_rmsprop_with_epsilon_outside_of_the_root():
+    random, rate = np.random.default_rng(0), 0.01
+    config = TrainingConfig(learning_rate=rate, decay=0.8, epsilon=1e-3)
+    optimizer = config.optimizer(2, 10)
+    value = random.standard_normal(20).astype(np.float32)
+    state, nu = optimizer.init(value), np.zeros(20)
+    for _ in range(4):
+        gradient = (random.standard_normal(20) * 10.0 ** random.uniform(-6, 2, 20)).astype(np.float32)
+        moved, state = optimizer.update(gradient, state)
+        nu = 0.8 * nu + 0.2 * gradient.astype(float) ** 2
+        np.testing.assert_allclose(moved, -rate * gradient / (np.sqrt(nu) + 1e-3), rtol=1e-5)
+
+
+def test_the_optimizer_follows_the_schedule():
+    optimizer = TrainingConfig(learning_rate=0.5, schedule="cosine", warmup_steps=2).optimizer(2, 6)
+    state, lengths = optimizer.init(np.ones(1, np.float32)), []
+    for step in range(6):
+        moved, state = optimizer.update(np.ones(1, np.float32), state)
+        lengths.append(-float(moved[0]) * math.sqrt(1 - 0.9 ** (step + 1)))
+    np.testing.assert_allclose(lengths, rates(steps=6, schedule="cosine", warmup_steps=2)[:6], atol=1e-5)
+
+
+# ---- Weights
+
+
+def test_weights_are_found_here_or_under_travjax_data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TRAVJAX_DATA", str(tmp_path / "data"))
+    (tmp_path / "data/imagenet").mkdir(parents=True)
+    far = tmp_path / "data/imagenet/w.npz"
+    far.touch()
+    assert find_weights("imagenet/w.npz") == far
+    assert find_weights(str(far)) == far
+    (tmp_path / "imagenet").mkdir()
+    (tmp_path / "imagenet/w.npz").touch()
+    assert find_weights("imagenet/w.npz") == Path("imagenet/w.npz")
+    assert find_weights("none") is None
+
+
+@pytest.mark.parametrize("data", [None, "", "/nowhere"])
+def test_missing_weights_are_one_line_that_says_what_to_do(tmp_path, monkeypatch, data):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TRAVJAX_DATA", data) if data is not None else monkeypatch.delenv("TRAVJAX_DATA", raising=False)
+    with pytest.raises(InputError) as raised:
+        find_weights("imagenet/w.npz")
+    where = "nor under TRAVJAX_DATA=/nowhere" if data else "and TRAVJAX_DATA is not set"
+    allowed = "allowed: --weights FILE, or none for random ones"
+    assert str(raised.value) == f"weights imagenet/w.npz: no such file here, {where}; {allowed}"
+
+
+def test_every_setting_is_explained():
+    for kind in (TrainingConfig, EvaluationConfig, Preset):
+        for field in fields(kind):
+            inner = field.name in ("dataset", "trunk", "heads", "training", "evaluation")
+            assert inner or field.name in kind.__doc__, field.name
