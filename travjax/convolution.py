@@ -194,8 +194,7 @@ def _batch_norm_forward(pixels, scale, bias, epsilon: float):
     mean = pixels.sum(axis=0) / len(pixels)
     var = _total(jnp.square(pixels - mean)) / len(pixels)
     inverse = lax.rsqrt(var + epsilon)
-    factor = scale * inverse
-    return (pixels * factor + (bias - mean * factor), mean, var), (pixels, mean, inverse, scale)
+    return ((pixels - mean) * (scale * inverse) + bias, mean, var), (pixels, mean, inverse, scale)
 
 
 def _batch_norm_backward(epsilon: float, saved, gradients):

@@ -82,10 +82,14 @@ def join(coordinator: str, processes: int, process: int) -> None:
     """Joins the processes of a run; to be called before anything else is asked of JAX.
 
     coordinator: address:port of process 0; processes: how many there are; process: which of them this is, from 0
-    Raises InputError when they do not find each other.
+    Raises InputError for arguments that cannot be. When the processes do not find each other, JAX ends them.
     """
-    require(processes >= 1, "--processes", processes, "at least 1")
-    require(0 <= process < processes, "--process", process, f"from 0 to {processes - 1}")
+    whole = lambda value: isinstance(value, int) and not isinstance(value, bool)
+    require(whole(processes) and processes >= 1, "--processes", processes, "at least 1")
+    require(whole(process) and 0 <= process < processes, "--process", process, f"from 0 to {processes - 1}")
+    host, _, port = coordinator.rpartition(":")
+    named = bool(host) and port.isdecimal() and 0 < int(port) < 65536
+    require(named, "--coordinator", coordinator, "address:port of process 0")
     try:
         jax.distributed.initialize(coordinator, processes, process)
     except (RuntimeError, ValueError) as error:

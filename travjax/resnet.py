@@ -81,7 +81,7 @@ class ConvNorm(nnx.Module):
         scale, bias, epsilon = self.scale[...], self.bias[...], self.config.epsilon
         if not train:
             factor = scale * jax.lax.rsqrt(self.var[...] + epsilon)
-            return (raw * factor + (bias - self.mean[...] * factor)).astype(raw.dtype)
+            return ((raw - self.mean[...]) * factor + bias).astype(raw.dtype)
         normalised, mean, var = batch_norm(raw, scale, bias, epsilon)
         kept = self.config.momentum
         self.mean[...] = kept * self.mean[...] + (1 - kept) * mean
