@@ -6,13 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commandline import FEW, Run, files, printed_files, run, run_words, succeeds
+from commandline import FEW, FEW_TOML, Run, files, printed_files, run, run_words, succeeds
 from PIL import Image
-from training import GRID, GRID_WORDS, HUSKY, begun, copy, dataset, loads, run_of
+from training import GRID, GRID_WORDS, HUSKY, begun, copy, dataset, forward, loads, run_of
 
 from travjax import metrics
 from travjax.checkpoint import load_meta
 from travjax.dataset import save
+from travjax.estimator import take_apart
 from travjax.inputs import render_inputs
 from travjax.sampling import every_sample
 from travjax.trained import load_estimator
@@ -36,7 +37,7 @@ def truth(trained) -> metrics.Evaluation:
     """The figures of a direct forward pass on images of all samples."""
     samples = every_sample(dataset().labels, dataset().maps_of("test"))
     images = render_inputs(dataset().heights, *samples, HUSKY, FEW, grid=GRID, elevation_scale=0.5)
-    logits = np.asarray(load_estimator(trained, "latest")[1](images))
+    logits = np.asarray(forward(*take_apart(load_estimator(trained, "latest")[1]), images))
     failed = np.asarray(unpacked(dataset().labels[samples])[0])
     return metrics.evaluate(1 / (1 + np.exp(-logits)), failed, dataset().group[samples[0]], recalls=[0.5])
 
@@ -210,7 +211,7 @@ def test_a_run_without_its_data_set_is_one_line(trained, tmp_path):
 
 def test_a_data_set_of_another_action_space_is_one_line(trained, tmp_path, few):
     other = tmp_path / "other.toml"
-    other.write_text("turns = 3\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1")
+    other.write_text(FEW_TOML.replace("turns = 2", "turns = 3"))
     done = run(tmp_path / "set", "dataset", "--maps", 3, *GRID_WORDS, "--robot", "husky_a200", "--actions", other)
     assert done.code == 0, done.err
     said = refusal(trained, "--data", tmp_path / "set", "--out", tmp_path / "out")
@@ -230,4 +231,4 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_notice(trained, tmp_path):
     words = ("--data", trained.parent / "set", "--checkpoint", "latest", "--figure-maps", 0, "--no-baselines")
     done = succeeds(tmp_path / "out", "evaluate", folder, *words)
     assert f"{last}: damaged checkpoint passed over: meta.json is missing" in done.out
-    assert results(done)["sample"]["position"]["total"] == 24
+    assert results(done)["sample"]["position"]["total"] == 27

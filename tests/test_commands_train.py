@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from commandline import FEW, files, printed_files, run, run_words
+from commandline import FEW, FEW_TOML, files, printed_files, run, run_words
 from commandline import Run as Done
 from PIL import Image
 from training import (
@@ -34,6 +34,9 @@ from travjax.dataset import ARRAYS, load, save
 from travjax.trained import Run
 
 pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+
+FEW_STEPS = TOML.replace("head_epochs = 2", "head_epochs = 1").replace("\nepochs = 2", "\nepochs = 1")
+FEW_STEPS = FEW_STEPS.replace("1e-3", "3e-5")  # RMSprop makes much of the last digits of small gradients
 
 KILLED = """
 import os, signal, sys
@@ -82,7 +85,7 @@ def program(words: tuple, *, script: str | None = None, devices: int = 1) -> sub
 
 def finished(*processes: subprocess.Popen, code: int = 0) -> list[tuple[str, str]]:
     try:
-        said = [process.communicate(timeout=120) for process in processes]
+        said = [process.communicate(timeout=400) for process in processes]
         for process, (_, err) in zip(processes, said, strict=True):
             assert process.returncode == code, err
         return said
@@ -95,12 +98,13 @@ def finished(*processes: subprocess.Popen, code: int = 0) -> list[tuple[str, str
 
 
 def test_everything_that_is_written_is_printed(trained):
-    names = {"run.json", "metrics.jsonl", "tensorboard", "checkpoints", "training.png"}
+    names = {"run.json", "metrics.jsonl", "tensorboard", "checkpoints", "inputs.png", "training.png"}
     assert {path.name for path in trained.iterdir()} == names
     out = (trained.parent / "out.txt").read_text()
     assert printed_files(Done(0, out, "", trained)) == {trained / name for name in names - {"run.json"}}
     assert f"\nNext: travjax evaluate {trained}\n" in out
-    Image.open(trained / "training.png").verify()
+    for name in ("inputs.png", "training.png"):
+        Image.open(trained / name).verify()
 
 
 def test_each_epoch_is_summed_up_in_a_line(trained):
@@ -130,9 +134,7 @@ def test_the_run_is_what_was_asked_for(trained):
 
 
 def test_a_run_makes_its_own_data_set_unless_one_is_given(tmp_path, few):
-    (tmp_path / "tiny.toml").write_text(
-        TOML.replace("head_epochs = 2", "head_epochs = 1").replace("\nepochs = 2", "\nepochs = 0")
-    )
+    (tmp_path / "tiny.toml").write_text(FEW_STEPS.replace("\nepochs = 1", "\nepochs = 0"))
     done = run(tmp_path / "run", "train", tmp_path / "tiny.toml", "--actions", few, *GRID_WORDS, "--seed", 5)
     assert done.code == 0, done.err
     made = load(tmp_path / "run/data")
@@ -145,8 +147,7 @@ def test_a_run_makes_its_own_data_set_unless_one_is_given(tmp_path, few):
 
 def test_the_folder_is_named_after_the_preset(tmp_path, monkeypatch, words):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "runs/train/tiny").mkdir(parents=True)
-    (tmp_path / "runs/train/tiny/run.json").touch()
+    (tmp_path / "runs/train/tiny/checkpoints/000001-step-1").mkdir(parents=True)
     assert refusal(words).startswith("--out runs/train/tiny: holds a training run; ")
 
 
@@ -195,8 +196,6 @@ def test_a_damaged_checkpoint_is_said_to_be_passed_over(trained, tmp_path, words
 
 # ---- Several devices, several processes
 
-FEW_STEPS = TOML.replace("head_epochs = 2", "head_epochs = 1").replace("\nepochs = 2", "\nepochs = 1")
-
 
 @pytest.fixture(scope="module")
 def alone(tmp_path_factory, words):
@@ -214,8 +213,8 @@ def require_close(folder, other):
     assert [row["step"] for row in one] == [row["step"] for row in two]
     assert one[-1]["step"] == 14
     for a, b in zip(one, two, strict=True):
-        for name in ("loss", "validation_loss"):
-            assert a.get(name) == pytest.approx(b.get(name), rel=1e-4), a["step"]
+        for name in {"loss", "validation_loss"} & a.keys():
+            assert a[name] == pytest.approx(b[name], rel=1e-4), (name, a["step"])
 
 
 def test_four_devices_train_like_one(alone, tmp_path):
@@ -274,12 +273,6 @@ def test_a_run_does_not_go_on_with_other_options(trained, words, more, message):
     assert refusal((*words, "--out", trained, "--resume", *more)) == f"--resume {trained}: {message}"
 
 
-def test_a_run_that_is_not_there_does_not_go_on(tmp_path, words):
-    said = refusal((*words, "--out", tmp_path / "none", "--resume"))
-    assert said.startswith(f"{tmp_path / 'none/run.json'}: cannot be read: No such file or directory")
-    assert files(tmp_path) == set()
-
-
 def test_missing_weights_are_one_line(tmp_path, monkeypatch, words):
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
     said = refusal((*words, "--out", tmp_path / "run", "--weights", "imagenet/w.npz"))
@@ -320,9 +313,7 @@ def test_a_missing_preset_is_one_line(tmp_path):
 def test_a_data_set_of_another_robot_or_action_space_is_one_line(tmp_path, words):
     said = refusal((*words, "--out", tmp_path / "run", "--robot", "leo_rover"))
     assert said.startswith("robot of the data set: name = 'Husky A200'") and "must be as here: name = 'Leo" in said
-    (tmp_path / "other.toml").write_text(
-        "turns = 3\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1"
-    )
+    (tmp_path / "other.toml").write_text(FEW_TOML.replace("turns = 2", "turns = 3"))
     said = refusal((*words, "--out", tmp_path / "run", "--actions", tmp_path / "other.toml"))
     assert said == "actions of the data set: turns = 2; must be as here: turns = 3"
     assert not (tmp_path / "run/run.json").exists()

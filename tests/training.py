@@ -12,7 +12,7 @@ from commandline import FEW, run_words
 
 from travjax.checkpoint import Checkpoints
 from travjax.dataset import Dataset, DatasetConfig, generate, save
-from travjax.estimator import Estimator, HeadsConfig, create
+from travjax.estimator import Estimator, HeadsConfig, create, put_together, take_apart
 from travjax.grid import Grid
 from travjax.parallel import Devices
 from travjax.preset import EvaluationConfig, Preset, TrainingConfig
@@ -97,6 +97,25 @@ def estimator(seed: int = 0) -> Estimator:
     return made
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def forward(graph, variables, images):
+    """Logits of images, in one piece of code: the same operations one by one take seconds to compile."""
+    return put_together(graph, variables)(images)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def features_of(graph, variables, images):
+    """The trunk's features of images."""
+    return put_together(graph, variables).trunk(images)[0]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def in_training(graph, variables, images, key):
+    """Logits of a forward pass with dropout and batch statistics, and the variables after it."""
+    made = put_together(graph, variables)
+    return made(images, train=True, key=key), take_apart(made)[1]
+
+
 def run_of(**training) -> Run:
     """PRESET's run with other settings of training."""
     return Run(replace(PRESET, training=replace(PRESET.training, **training)), HUSKY, FEW, GRID)
@@ -104,6 +123,7 @@ def run_of(**training) -> Run:
 
 def trainer(folder: Path, data: Dataset | None = None, **training) -> Trainer:
     """A trainer that has not begun."""
+    folder.mkdir(parents=True, exist_ok=True)
     return Trainer(run_of(**training), data or dataset(), folder, Devices.all(), quiet=True)
 
 
@@ -117,7 +137,8 @@ def begun(folder: Path, data: Dataset | None = None, **training) -> Trainer:
 def host(tree) -> dict[str, np.ndarray]:
     """The leaves by path, as copies on the host."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.array(leaf) for path, leaf in leaves}
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): np.array(leaf) for path, leaf in leaves}
+    return {name.removesuffix("/value"): array for name, array in named.items()}
 
 
 def require_equal(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:

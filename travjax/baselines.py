@@ -28,9 +28,9 @@ def slope_and_step(
         chosen = heights[maps].astype(np.float64)
         slope = np.hypot(*np.gradient(chosen, grid.spacing, axis=(1, 2)))
         col, row = np.moveaxis(place[samples[1][part]], -1, 0)
-        along = lambda field: np.nan_to_num(field[which[:, None], row, col])  # noqa: B023
-        result[part, 0] = np.arctan(along(slope)).max(axis=1)
-        result[part, 1] = np.abs(np.diff(along(chosen), axis=1)).max(axis=1)
+        slopes, ground = (field[which[:, None], row, col] for field in (slope, chosen))
+        result[part, 0] = np.nan_to_num(np.arctan(slopes)).max(axis=1)
+        result[part, 1] = np.nan_to_num(np.abs(np.diff(ground, axis=1))).max(axis=1)
     return result
 
 

@@ -20,9 +20,10 @@ from travjax.inputs import ImageSource, trajectory_bank
 from travjax.parallel import Devices
 from travjax.prediction import over_samples, sample_logits
 from travjax.preset import TrainingConfig
+from travjax.resnet import ResNetConfig
 from travjax.robot import Robot
 from travjax.sampling import Sampler, batches
-from travjax.train import update
+from travjax.training_step import update
 from travjax.traverse import EVENTS, unpacked
 
 COLUMNS = {
@@ -44,14 +45,16 @@ FLAX, TORCH = "training step, Flax", "training step, PyTorch"
 
 
 class Bench:
-    """A small data set on the devices and the ResNet50 estimator with random weights."""
+    """A small data set on the devices and the estimator with random weights, a ResNet50 unless said otherwise."""
 
-    def __init__(self, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int):
+    def __init__(
+        self, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int, trunk: ResNetConfig = ResNetConfig()
+    ):
         self.repeats, self.devices = repeats, Devices.all()
         self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
         bank = trajectory_bank(robot, actions, grid)
         self.source = self.devices.replicate(ImageSource(self.dataset.heights, bank, np.float32(1)))
-        self.graph, self.variables = take_apart(create())
+        self.graph, self.variables = take_apart(create(trunk))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
@@ -144,8 +147,8 @@ def with_ratio(rows: list[dict]) -> list[dict]:
     return [row | {"ratio": ratio if row["what"] == FLAX else None} for row in rows]
 
 
-def _torch_training(grid: Grid) -> Callable[[], object]:
-    """A training step of the estimator in PyTorch on a fixed batch of random images."""
+def torch_estimator():
+    """The estimator in PyTorch: (trunk, heads), for images in channels-last form."""
     import torch
     from torch import nn
 
@@ -176,7 +179,15 @@ def _torch_training(grid: Grid) -> Callable[[], object]:
         return nn.Sequential(*layers, nn.AdaptiveAvgPool2d(1), nn.Flatten())
 
     head = lambda: nn.Sequential(nn.Linear(2048, 512), nn.ReLU(inplace=True), nn.Dropout(0.2), nn.Linear(512, 1))
-    body, heads = trunk().to(memory_format=torch.channels_last), nn.ModuleList(head() for _ in EVENTS)
+    return trunk().to(memory_format=torch.channels_last), nn.ModuleList(head() for _ in EVENTS)
+
+
+def _torch_training(grid: Grid) -> Callable[[], object]:
+    """A training step of the PyTorch estimator on a fixed batch of random images."""
+    import torch
+    from torch import nn
+
+    body, heads = torch_estimator()
     parameters = [*body.parameters(), *heads.parameters()]
     optimizer = torch.optim.RMSprop(parameters, lr=1e-4, alpha=0.9, eps=1e-7)
     images = torch.rand(STEP_BATCH, 3, *grid.shape).to(memory_format=torch.channels_last)

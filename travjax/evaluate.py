@@ -7,6 +7,7 @@ import numpy as np
 
 from travjax import metrics
 from travjax.baselines import LogisticRegression, slope_and_step
+from travjax.config import require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import Estimator, take_apart
 from travjax.inputs import ImageSource, trajectory_bank
@@ -43,12 +44,18 @@ class Evaluator:
         return Evaluator(run, dataset, devices.replicate(source), devices)
 
     def samples(self, maps: int, each: int) -> Samples:
-        """Random test samples at natural frequency: of so many maps so many trajectories; 0 for all."""
+        """Random test samples at natural frequency: of so many maps so many trajectories; 0 for all.
+
+        Raises InputError when there is none.
+        """
         labels, test = self.dataset.labels, self.dataset.maps_of("test")
-        if not maps and not each:
-            return every_sample(labels, test)
-        seed = self.run.preset.training.seed
-        return natural_sample(labels, test, seed, maps or len(test), each or labels.shape[1])
+        if maps or each:
+            seed = self.run.preset.training.seed
+            samples = natural_sample(labels, test, seed, maps or max(len(test), 1), each or labels.shape[1])
+        else:
+            samples = every_sample(labels, test)
+        require(len(samples[0]) > 0, "data set, test split", 0, "at least one known trajectory")
+        return samples
 
     def failed(self, samples: Samples) -> np.ndarray:
         """Failures of samples: [k, 3] bool."""

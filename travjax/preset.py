@@ -59,6 +59,7 @@ class TrainingConfig:
     def __post_init__(self):
         _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing", least=0)
         _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
+        require(self.seed < 2**31, "seed", self.seed, f"at most {2**31 - 1}")
         require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
         require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
         require_number("decay", self.decay, 0, 1, "above 0 and at most 1")

@@ -22,7 +22,10 @@ class RunLog:
         kept = [row for row in read_rows(self.path) if row["step"] <= step] if step else []
         with written_whole(self.path) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
-        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
+        try:
+            self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
+        except OSError as error:
+            raise InputError(f"{folder / 'tensorboard'}: cannot be written: {error.strerror}") from None
 
     def write(self, row: dict[str, Any]) -> None:
         """Appends a row; a dict in it is a group of numbers."""

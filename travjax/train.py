@@ -1,40 +1,38 @@
 """Training in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
 
-The state is a dict of pytrees: parameters of "trunk" and "heads", the trunk's running "statistics", and the "optimizer"
-state of what the phase trains. A step is one jitted function of state and batch. All that is random follows from the
-training seed and the step, so a run that was interrupted goes on as if it had not been.
+All that is random follows from the training seed and the step, so a run that was interrupted goes on as if it had not
+been. What a step does is in training_step.py, on which samples in training_data.py.
 """
 
 import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 import optax
-from flax import nnx
 from tqdm import tqdm
 
 from travjax import metrics
 from travjax.checkpoint import Checkpoints
-from travjax.config import InputError, require
+from travjax.config import InputError
 from travjax.dataset import Dataset, require_same
-from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
+from travjax.estimator import VARIABLES, Estimator, take_apart
 from travjax.inputs import ImageSource, trajectory_bank
 from travjax.parallel import Devices
 from travjax.prediction import feature_logits, over_samples, probabilities, sample_features, sample_logits
 from travjax.runlog import RunLog
-from travjax.sampling import Sampler, Samples, balanced_subset, batches, random_keys
+from travjax.sampling import Samples
 from travjax.trained import TRAINED, Run
-from travjax.traverse import EVENTS, unpacked
-
-State = dict[str, Any]
+from travjax.training_data import TrainingData
+from travjax.training_step import State, is_finite, update
+from travjax.traverse import EVENTS
 
 IN_FLIGHT = 2
 """Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
@@ -60,46 +58,10 @@ class Position:
     best: float = -1.0
 
 
-def _heads_alone(estimator: Estimator, features, key):
-    return estimator.heads(features, key)
-
-
-def _everything(estimator: Estimator, inputs, key):
-    source, map_index, trajectory_index = inputs
-    return estimator(source.images(map_index, trajectory_index), train=True, key=key)
-
-
-FORWARD = {1: _heads_alone, 2: _everything}
-"""The logits of a training step of each phase."""
-
-
-@partial(jax.jit, static_argnames=("graph", "phase", "optimizer", "weight_decay"), donate_argnames="state")
-def update(state: State, inputs, failed, weight, seed, step, *, graph, phase: int, optimizer, weight_decay: float):
-    """One step of a phase: the new state, and the mean over the batch of the cross-entropy summed over the events.
-
-    inputs: what FORWARD takes; failed: [b, 3]; weight: [b], 0 for a sample that only fills the batch up
-    """
-
-    key = jax.random.fold_in(jax.random.key(seed), step)
-
-    def loss(parameters):
-        estimator = put_together(graph, state | parameters)
-        logits = FORWARD[phase](estimator, inputs, key)
-        entropy = optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1)
-        entropy = (entropy * weight).sum() / weight.sum()
-        penalty = weight_decay * estimator.heads.squares()
-        return entropy + penalty, (entropy, nnx.state(estimator, nnx.BatchStat))
-
-    parameters = {name: state[name] for name in TRAINED[phase]}
-    gradients, (entropy, statistics) = jax.grad(loss, has_aux=True)(parameters)
-    updates, moved = optimizer.update(gradients, state["optimizer"], parameters)
-    return state | optax.apply_updates(parameters, updates) | {"statistics": statistics, "optimizer": moved}, entropy
-
-
 class Trainer:
     """One training run.
 
-    state: see the module; position: where it stands
+    data: what is trained on; state: that of training_step.py; position: where it stands
     Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
     validation samples, or when the devices cannot share a batch.
     """
@@ -107,35 +69,14 @@ class Trainer:
     def __init__(self, run: Run, dataset: Dataset, folder: Path, devices: Devices, quiet: bool = False):
         require_same(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
-        self.run, self.dataset, self.folder, self.devices = run, dataset, folder, devices
+        self.run, self.folder, self.devices = run, folder, devices
         self.config = run.preset.training
+        self.data = TrainingData(dataset, self.config)
         self.quiet = quiet or not devices.main
         self.checkpoints = Checkpoints(folder / "checkpoints")
         self.position = Position()
         self._optimizers: dict[int, optax.GradientTransformation] = {}
         self.graph = run.graph()
-        for split, samples in (("train", self.samples(1, 0)), ("validation", self.validation)):
-            require(len(samples[0]) > 0, f"data set, {split} split", 0, "at least one known trajectory")
-
-    # What is trained on
-
-    @cached_property
-    def _sampler(self) -> Sampler:
-        config, maps = self.config, self.dataset.maps_of("train")
-        return Sampler(self.dataset.labels, maps, config.seed, config.each, config.failing, config.fresh)
-
-    def samples(self, phase: int, epoch: int) -> Samples:
-        """Training samples of an epoch; phase 1 has the same ones in all."""
-        return self._sampler.epoch(0 if phase == 1 else epoch + 1)
-
-    @cached_property
-    def validation(self) -> Samples:
-        """The balanced subset of the validation maps, or as many of it as the configuration allows."""
-        config, maps = self.config, self.dataset.maps_of("validation")
-        samples = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
-        keys = random_keys(("validation", config.seed), np.arange(len(samples[0])))
-        chosen = np.sort(np.argsort(keys)[: config.validation_samples])
-        return samples[0][chosen], samples[1][chosen]
 
     @cached_property
     def source(self) -> ImageSource:
@@ -143,33 +84,19 @@ class Trainer:
         run = self.run
         with self._bar("trajectory bank", len(run.actions), "trajectory") as bar:
             bank = trajectory_bank(run.robot, run.actions, run.grid, on_progress=bar.update)
-        return self.devices.replicate(ImageSource(self.dataset.heights, bank, np.float32(run.preset.elevation_scale)))
+        source = ImageSource(self.data.dataset.heights, bank, np.float32(run.preset.elevation_scale))
+        return self.devices.replicate(source)
 
     @cached_property
     def _features(self) -> dict[str, np.ndarray]:
         """The frozen trunk's features of the samples of phase 1, computed once."""
-        samples = {"training": self.samples(1, 0), "validation": self.validation}
+        samples = {"training": self.data.samples(1, 0), "validation": self.data.validation}
         return {name: self._over(sample_features, part, f"{name} features") for name, part in samples.items()}
-
-    def _batches(self, phase: int, epoch: int) -> Iterator[tuple[Any, np.ndarray, np.ndarray]]:
-        """Inputs, failures [b, 3] and weights [b] of the steps of an epoch, on the host."""
-        samples, order = self.samples(phase, epoch), np.arange(len(self.samples(phase, epoch)[0]))
-        failed = _failed(self.dataset, samples)
-        stream = 2 * epoch + phase - 1  # another order in each epoch of each phase
-        for index, _, weight in zip(
-            *batches((order, order), self.config.batch_size, self.config.seed, stream), strict=True
-        ):
-            inputs = self._features["training"][index] if phase == 1 else (samples[0][index], samples[1][index])
-            yield inputs, failed[index], weight
-
-    def _steps(self, phase: int, epoch: int) -> int:
-        return -(-len(self.samples(phase, epoch)[0]) // self.config.batch_size)
-
-    # The run
 
     def start(self, estimator: Estimator) -> None:
         """Begins with an estimator, whose trunk phase 1 leaves as it is."""
-        self.state: State = self.devices.replicate(take_apart(estimator)[1])
+        variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
+        self.state: State = self.devices.replicate(variables)
         self._begin(1 if self.config.head_epochs else 2)
         self._open_log()
 
@@ -204,6 +131,7 @@ class Trainer:
 
     def _begin(self, phase: int) -> None:
         """A new optimizer, for what the phase trains."""
+        self.__dict__.pop("_features", None)  # gigabytes for a large data set
         self.position.phase, self.position.epoch = phase, 0
         trained = {name: self.state[name] for name in TRAINED[phase]}
         optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
@@ -211,31 +139,41 @@ class Trainer:
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
         if phase not in self._optimizers:  # the same object each time: jit compiles for it
-            steps = self._steps(phase, 0) * (self.config.head_epochs, self.config.epochs)[phase - 1]
+            steps = self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
             self._optimizers[phase] = self.config.optimizer(phase, steps)
         return self._optimizers[phase]
 
     def _train_epoch(self) -> None:
         """From the present step to the end of the epoch, its validation and its checkpoint."""
-        here, size = self.position, self.config.batch_size
-        steps, count = self._steps(here.phase, here.epoch), len(self.samples(here.phase, here.epoch)[0])
-        if here.phase == 1:
-            self._features  # noqa: B018, computed before time is taken
-        began, before = time.perf_counter(), here.samples
+        here, data = self.position, self.data
+        steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
+        inputs_of = self._inputs()
+        began = time.perf_counter()
         running: deque[tuple[jax.Array, float]] = deque()
-        with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=here.step * size) as bar:
-            for batch in itertools.islice(self._batches(here.phase, here.epoch), here.step, None):
-                running.append((self._step(*batch), float(batch[2].sum())))
+        with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=int(done)) as bar:
+            for places, failed, weight in itertools.islice(data.batches(here.phase, here.epoch), here.step, None):
+                running.append((self._step(inputs_of(places), failed, weight), float(weight.sum())))
                 here.step, here.total = here.step + 1, here.total + 1
                 saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
                 while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
                     self._count(*running.popleft(), here.step - len(running), bar)
+                if not running and not is_finite(self.state):
+                    raise self._diverged("a parameter that is no number", here.step)
                 if here.samples and here.step % max(steps // REPORTS, 1) == 0 and here.step < steps:
-                    rate = (here.samples - before) / (time.perf_counter() - began)
+                    rate = (here.samples - done) / (time.perf_counter() - began)
                     self._report({"loss": here.loss / here.samples, "samples_per_s": rate})
                 if saves:
                     self.checkpoints.save(here.total, self.state, self._meta(here.phase))
-        self._finish_epoch((here.samples - before) / (time.perf_counter() - began))
+        self._finish_epoch((here.samples - done) / (time.perf_counter() - began))
+
+    def _inputs(self) -> Callable[[np.ndarray], Any]:
+        """What a step of this epoch takes, from the places of its samples; features are computed if need be."""
+        here = self.position
+        if here.phase == 1:
+            features = self._features["training"]
+            return lambda places: features[places]
+        maps, trajectories = self.data.samples(here.phase, here.epoch)
+        return lambda places: (maps[places], trajectories[places])
 
     def _step(self, inputs, failed, weight) -> jax.Array:
         phase = self.position.phase
@@ -258,13 +196,16 @@ class Trainer:
         """Adds a batch to the epoch's sums."""
         here, value = self.position, float(loss)
         if not math.isfinite(value):
-            where = f"batch {number} of phase {here.phase}, epoch {here.epoch + 1}"
-            raise InputError(
-                f"loss = {value} in {where}: training stopped; the last checkpoint is kept, try a lower learning_rate"
-            )
+            raise self._diverged(f"loss = {value}", number)
         here.loss, here.samples = here.loss + value * samples, here.samples + samples
         bar.set_postfix(loss=f"{here.loss / here.samples:.3f}", refresh=False)
         bar.update(int(samples))
+
+    def _diverged(self, what: str, number: int) -> InputError:
+        where = f"batch {number} of phase {self.position.phase}, epoch {self.position.epoch + 1}"
+        return InputError(
+            f"{what} in {where}: training stopped; the last checkpoint is kept, try a lower learning_rate"
+        )
 
     def _finish_epoch(self, rate: float) -> None:
         here = self.position
@@ -283,8 +224,8 @@ class Trainer:
             features = self.devices.replicate(self._features["validation"])
             logits = self.devices.fetch(feature_logits(self.graph, variables, features))
         else:
-            logits = self._over(sample_logits, self.validation, "validation")
-        failed = _failed(self.dataset, self.validation)
+            logits = self._over(sample_logits, self.data.validation, "validation")
+        failed = self.data.failed(self.data.validation)
         share = failed.mean(axis=0, dtype=np.float64)
         constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
         scores = metrics.evaluate(probabilities(logits), failed.astype(bool))
@@ -295,21 +236,13 @@ class Trainer:
             "f1": metrics.to_json(scores.f1),
         }
 
-    # Small things
-
     def summary(self) -> str:
         """One line: what is trained on what."""
-        run, samples = self.run, self.samples(2, 0)
-        share = _failed(self.dataset, samples).any(axis=1).mean()
-        parts = (
-            f"{run.robot.name}, {len(run.actions)} trajectories a map",
-            f"{len(self.dataset.maps_of('train'))} training maps",
-            f"{len(samples[0])} samples an epoch, {share:.0%} of which fail",
-            f"{len(self.validation[0])} validation samples",
-            f"first weights: {run.preset.weights}",
-            f"devices: {self.devices.mesh.size} x {jax.devices()[0].device_kind}",
+        run, device = self.run, jax.devices()[0].device_kind
+        return (
+            f"{run.robot.name}, {len(run.actions)} trajectories a map; {self.data.summary()}; first weights: "
+            f"{run.preset.weights}; devices: {self.devices.mesh.size} x {device}"
         )
-        return "; ".join(parts)
 
     def _over(self, function, samples: Samples, what: str) -> np.ndarray:
         variables = {name: self.state[name] for name in VARIABLES}
@@ -326,8 +259,9 @@ class Trainer:
 
     def _report(self, row: dict[str, Any]) -> None:
         here = self.position
-        schedule = self.config.schedule_of(here.phase, self._steps(here.phase, 0) * self.config.epochs)
-        rate = float(schedule(here.epoch * self._steps(here.phase, here.epoch) + here.step))
+        steps = self.data.steps(here.phase)
+        schedule = self.config.schedule_of(here.phase, steps * self.config.epochs)
+        rate = float(schedule(here.epoch * steps + here.step))
         place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
         if self.log:
             self.log.write(place | row)
@@ -338,11 +272,6 @@ class Trainer:
     def _say(self, text: str) -> None:
         if not self.quiet:
             tqdm.write(text)
-
-
-def _failed(dataset: Dataset, samples: Samples) -> np.ndarray:
-    """Failures of samples: [k, 3] float32."""
-    return np.asarray(unpacked(dataset.labels[samples])[0], np.float32)
 
 
 def _summary(here: Position, row: dict[str, Any], best: bool) -> str:

@@ -57,7 +57,7 @@ class Run:
             ) from None
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        except (ValueError, LookupError, TypeError):
+        except (ValueError, LookupError, TypeError, AttributeError):
             raise InputError(f"{path}: not the run.json of a training run") from None
 
     def require_same(self, other: "Run", what: str) -> None:

@@ -42,10 +42,10 @@ def read_arrays(path: Path) -> tuple[Arrays, dict]:
 
 def write_safetensors(path: Path, arrays: Arrays, notes: dict) -> None:
     """Writes arrays and notes (numbers and texts), whole or not at all."""
-    from safetensors.numpy import save_file
+    from safetensors.numpy import save
 
     with written_whole(path) as temporary:
-        save_file(arrays, temporary, metadata={"travjax": json.dumps(notes)})
+        temporary.write_bytes(save(arrays, metadata={"travjax": json.dumps(notes)}))  # save_file hides it from others
 
 
 def _npz(path: Path) -> tuple[Arrays, dict]:

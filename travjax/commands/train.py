@@ -140,14 +140,17 @@ def _draw_inputs(trainer, folder: Path) -> Path:
     import numpy as np
 
     from travjax import curves, plots
+    from travjax.inputs import render_inputs
 
-    samples = trainer.samples(2, 0)
+    samples, data, run = trainer.data.samples(2, 0), trainer.data.dataset, trainer.run
     chosen = np.linspace(0, len(samples[0]) - 1, 4).astype(int)
     maps, trajectories = (index[chosen] for index in samples)
-    images = np.asarray(trainer.source.images(maps, trajectories))
-    groups = trainer.dataset.group[maps]
-    titles = [f"{group}, trajectory {index}" for group, index in zip(groups, trajectories, strict=True)]
-    return plots.save(curves.input_channels_figure(images, titles, trainer.run.grid), folder / "inputs.png")
+    scale = run.preset.elevation_scale
+    images = render_inputs(
+        data.heights[maps], np.arange(4), trajectories, run.robot, run.actions, grid=run.grid, elevation_scale=scale
+    )
+    titles = [f"{group}, trajectory {index}" for group, index in zip(data.group[maps], trajectories, strict=True)]
+    return plots.save(curves.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png")
 
 
 def _finish(folder: Path) -> None:
