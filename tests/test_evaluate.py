@@ -10,7 +10,7 @@ from training import GRID, HUSKY, PRESET, dataset, estimator, forward, run_of
 
 from travjax import evaluate
 from travjax.baselines import slope_and_step
-from travjax.config import InputError
+from travjax.config import InputError, require
 from travjax.estimator import take_apart
 from travjax.evaluate import Evaluator
 from travjax.inputs import render_inputs
@@ -72,6 +72,14 @@ def test_a_data_set_without_test_maps_is_refused():
     with pytest.raises(InputError, match="test") as raised:
         Evaluator.of(run_of(), data, Devices.all()).samples(0, 0)
     assert "\n" not in str(raised.value)
+
+
+def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
+    monkeypatch.setattr(
+        "travjax.parallel.Devices.check_batch", lambda self, size: require(size == 9, "batch_size", size, "9")
+    )
+    with pytest.raises(InputError, match="batch_size = 8"):
+        Evaluator.of(run_of(), dataset(), Devices.all())
 
 
 @pytest.mark.parametrize(

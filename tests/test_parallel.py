@@ -161,5 +161,5 @@ def test_an_address_without_a_port_is_refused_in_one_line(coordinator):
         env=os.environ | {"JAX_PLATFORMS": "cpu"},
     )
     last = done.stderr.splitlines()[-1]
-    assert last.startswith(f"travjax.config.InputError: --coordinator {coordinator}".rstrip())
-    assert last.endswith("allowed: address:port of process 0")
+    assert last.startswith(f"travjax.config.InputError: --coordinator = {coordinator!r}: must be address:port")
+    assert last.endswith("must be address:port of process 0")

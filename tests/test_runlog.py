@@ -95,7 +95,7 @@ def test_a_damaged_line_is_named(tmp_path):
     for call in (lambda: read_rows(path), lambda: RunLog(tmp_path, 2)):
         with pytest.raises(InputError) as raised:
             call()
-        assert str(raised.value) == f"{path}: line 2: not JSON"
+        assert str(raised.value) == f"{path}: line 2: not a row with its step"
 
 
 def test_what_cannot_be_written_is_one_line(tmp_path):

@@ -253,6 +253,18 @@ def test_fresh_samples_are_others_in_each_epoch_of_the_second_phase(tmp_path):
         assert set(dataset().split[samples[0]]) == {0}
 
 
+def test_the_subset_of_an_epoch_is_drawn_once(tmp_path, monkeypatch):
+    data, drawn = begun(tmp_path, head_epochs=0).data, []
+    draw = type(data._sampler).epoch
+    monkeypatch.setattr(type(data._sampler), "epoch", lambda self, number: drawn.append(number) or draw(self, number))
+    for epoch in range(3):
+        for _ in range(2):
+            data.samples(2, epoch)
+            data.steps(2)
+            data.steps(1)
+    assert sorted(set(drawn)) == sorted(drawn)
+
+
 def test_an_epoch_takes_each_sample_once_and_in_another_order_each_time(tmp_path):
     made = begun(tmp_path, fresh=False)
     count = len(made.data.samples(2, 0)[0])

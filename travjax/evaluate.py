@@ -27,7 +27,8 @@ REGRESSION_SAMPLES = 50_000
 class Evaluator:
     """A run's data set on the devices, ready for its estimators.
 
-    Raises InputError when the data set is not for the run's robot, action space and grid.
+    Raises InputError when the data set is not for the run's robot, action space and grid, or when the devices cannot
+    share a batch.
     """
 
     run: Run
@@ -39,6 +40,7 @@ class Evaluator:
     def of(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
         """Puts the images' parts on the devices."""
         require_same(dataset, run.robot, run.actions, run.grid)
+        devices.check_batch(run.preset.training.batch_size)
         bank = trajectory_bank(run.robot, run.actions, run.grid)
         source = ImageSource(dataset.heights, bank, np.float32(run.preset.elevation_scale))
         return Evaluator(run, dataset, devices.replicate(source), devices)

@@ -53,8 +53,10 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
-            rows.append(json.loads(line))
-        except ValueError:
+            row = json.loads(line)
+            row["step"] + 0
+            rows.append(row)
+        except (ValueError, LookupError, TypeError):
             if number < len(lines):
-                raise InputError(f"{path}: line {number}: not JSON") from None
+                raise InputError(f"{path}: line {number}: not a row with its step") from None
     return rows

@@ -225,6 +225,8 @@ class Trainer:
             logits = self.devices.fetch(feature_logits(self.graph, variables, features))
         else:
             logits = self._over(sample_logits, self.data.validation, "validation")
+        if not np.isfinite(logits).all():
+            raise self._diverged("a validation logit that is no number", self.position.step)
         failed = self.data.failed(self.data.validation)
         share = failed.mean(axis=0, dtype=np.float64)
         constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
@@ -261,7 +263,7 @@ class Trainer:
         here = self.position
         steps = self.data.steps(here.phase)
         schedule = self.config.schedule_of(here.phase, steps * self.config.epochs)
-        rate = float(schedule(here.epoch * steps + here.step))
+        rate = float(schedule(here.epoch * steps + here.step - 1))  # of the step before
         place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
         if self.log:
             self.log.write(place | row)

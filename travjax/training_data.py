@@ -30,7 +30,9 @@ class TrainingData:
         """Training samples of an epoch; phase 1 has the same ones in all."""
         number = 0 if phase == 1 else epoch + 1
         if number not in self._kept:
-            self._kept = {0: self._kept.get(0, self._sampler.epoch(0)), number: self._sampler.epoch(number)}
+            # Those that steps are counted by stay; others are forgotten, a draw of a large data set takes a second.
+            counted = {kept: samples for kept, samples in self._kept.items() if kept < 2}
+            self._kept = counted | {number: self._sampler.epoch(number)}
         return self._kept[number]
 
     @cached_property
@@ -55,7 +57,10 @@ class TrainingData:
         return -(-self.count(phase, epoch) // self.config.batch_size)
 
     def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Places in `samples` [b], failures [b, 3] and weights [b] of each step, in an order of the epoch's own."""
+        """Places in `samples` [b], failures [b, 3] and weights [b] of each step, in an order of the epoch's own.
+
+        The samples that fill up the last batch have weight 0, but count in its batch statistics.
+        """
         samples = self.samples(phase, epoch)
         failed, places = self.failed(samples), np.arange(len(samples[0]))
         stream = 2 * epoch + phase - 1

@@ -12,8 +12,8 @@ from travjax.config import require
 from travjax.files import output_folder, written_whole
 
 CALIBRATION = (
-    "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by how "
-    "much); choose a threshold from the table above."
+    "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by "
+    "how much); choose a threshold from the table above."
 )
 
 

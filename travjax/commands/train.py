@@ -132,7 +132,10 @@ def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
     if devices.main and not (kept / "dataset.json").exists():
         made(wanted.preset.dataset, wanted.robot, wanted.actions, wanted.grid, kept)
     devices.wait()
-    return dataset.load(kept)
+    loaded, config = dataset.load(kept), wanted.preset.dataset
+    made_anew = "remove it to have it made anew, or take another --out"
+    require(loaded.config == config, f"data set {kept}", loaded.config, f"made from {config}; {made_anew}")
+    return loaded
 
 
 def _draw_inputs(trainer, folder: Path) -> Path:
