@@ -9,13 +9,15 @@ from sklearn.linear_model import LogisticRegression as Oracle
 from training import GRID, HUSKY, PRESET, dataset, estimator, forward, run_of
 
 from travjax import evaluate
+from travjax.actions import ActionSpace
 from travjax.baselines import slope_and_step
 from travjax.config import InputError, require
 from travjax.estimator import take_apart
 from travjax.evaluate import Evaluator
 from travjax.inputs import render_inputs
-from travjax.metrics import average_precision
+from travjax.metrics import PAPER_SYNTHETIC, average_precision
 from travjax.parallel import Devices
+from travjax.robot import Robot
 from travjax.sampling import balanced_subset
 from travjax.traverse import unpacked
 
@@ -72,6 +74,13 @@ def test_a_data_set_without_test_maps_is_refused():
     with pytest.raises(InputError, match="test") as raised:
         Evaluator.of(run_of(), data, Devices.all()).samples(0, 0)
     assert "\n" not in str(raised.value)
+
+
+def test_the_paper_stands_beside_its_own_robot_and_actions_on_synthetic_maps_only(evaluator):
+    assert evaluator.paper is None
+    papers = replace(run_of(), robot=Robot.load("seekur_jr"), actions=ActionSpace())
+    assert replace(evaluator, run=papers).paper == PAPER_SYNTHETIC
+    assert replace(evaluator, run=papers, dataset=replace(dataset(), config=None)).paper is None
 
 
 def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):

@@ -1,6 +1,6 @@
 """Evaluation of a trained estimator on the test maps of a data set (SPEC section 10)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from travjax.parallel import Devices
 from travjax.prediction import over_samples, probabilities, sample_logits
 from travjax.sampling import Samples, balanced_subset, every_sample, natural_sample
 from travjax.trained import Run
-from travjax.traverse import unpacked
+from travjax.traverse import as_in_paper, unpacked
 
 Progress = Callable[[int], object]
 
@@ -80,7 +80,13 @@ class Evaluator:
         features = [slope_and_step(heights, part, run.actions, run.grid) for part in (known, samples)]
         return LogisticRegression.fit(features[0], self.failed(known)).probabilities(features[1])
 
+    @property
+    def paper(self) -> Mapping[str, metrics.Confusion] | None:
+        """The paper's confusion matrices, if they compare: synthetic maps, its robot and its action space."""
+        compares = self.dataset.config and as_in_paper(self.run.robot, self.run.actions)
+        return metrics.PAPER_SYNTHETIC if compares else None
+
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
         """All figures of predicted probabilities [k, 3], by style or site as well."""
         groups = self.dataset.group[samples[0]]
-        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls)
+        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls, paper=self.paper)

@@ -68,6 +68,11 @@ def default_robot() -> Robot:
     return Robot.load("seekur_jr")
 
 
+def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
+    """Whether these are the paper's, so that figures on synthetic maps compare with its own."""
+    return robot == default_robot() and actions == ActionSpace()
+
+
 def chosen_robot(robot: Robot | str | None) -> Robot:
     """The robot that an argument names: the default one for None, else as `Robot.load` takes it."""
     return default_robot() if robot is None else Robot.load(robot)

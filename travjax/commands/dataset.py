@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from travjax import tfds_builder
+from travjax import tfds_builder, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import InputError, require
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
         grid, robot, actions = options.configuration(arguments)
         config = DatasetConfig(arguments.maps, arguments.seed, arguments.validation, arguments.test)
         dataset = made(config, robot, actions, grid, folder)
-    as_in_paper = dataset.config is not None and options.as_in_paper(dataset.robot, dataset.actions)
+    as_in_paper = dataset.config is not None and traverse.as_in_paper(dataset.robot, dataset.actions)
     table = statistics_table(dataset, as_in_paper=as_in_paper)
     sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
     trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"

@@ -4,6 +4,7 @@ import argparse
 import json
 from pathlib import Path
 
+import numpy as np
 from tqdm import tqdm
 
 from travjax.commands import options
@@ -60,7 +61,7 @@ def run(arguments: argparse.Namespace) -> None:
     others = {}
     if not arguments.no_baselines:
         others = _baselines(arguments.folder, evaluator, samples, arguments.recall)
-    _write_tables(out, scores, others, _description(evaluator, samples, arguments, meta))
+    _write_tables(out, scores, others, _description(evaluator, samples, arguments, meta), evaluator.paper)
     _draw(out, evaluator, estimator, scores, others, arguments.figure_maps)
 
 
@@ -96,14 +97,14 @@ def _description(evaluator, samples, arguments: argparse.Namespace, meta: dict) 
         "checkpoint": arguments.checkpoint,
         "position": meta["position"],
         "samples": len(samples[0]),
-        "maps": len(set(samples[0].tolist())),
+        "maps": len(np.unique(samples[0])),
         "test_maps": len(data.maps_of("test")),
         "robot": trained.robot.name,
         "trajectories": len(trained.actions),
     }
 
 
-def _write_tables(out: Path, scores, others: dict, description: dict) -> None:
+def _write_tables(out: Path, scores, others: dict, description: dict, paper) -> None:
     from travjax import report
     from travjax.metrics import to_json
 
@@ -111,8 +112,8 @@ def _write_tables(out: Path, scores, others: dict, description: dict) -> None:
     average_precisions |= {name: other.average_precision for name, other in others.items()}
     tables = [
         "{samples} samples of {maps} of {test_maps} test maps, {robot}; checkpoint {checkpoint}".format(**description),
-        report.metrics_table(scores),
-        report.threshold_table(scores),
+        report.metrics_table(scores, paper),
+        report.threshold_table(scores, paper),
         CALIBRATION,
         report.groups_table(scores),
         report.baselines_table(average_precisions),
@@ -130,7 +131,8 @@ def _write_tables(out: Path, scores, others: dict, description: dict) -> None:
 def _draw(out: Path, evaluator, estimator, scores, others: dict, maps: int) -> None:
     from travjax import curves, plots
 
-    print(plots.save(curves.precision_recall_figure(scores, baselines=others), out / "precision_recall.png"))
+    figure = curves.precision_recall_figure(scores, evaluator.paper, others)
+    print(plots.save(figure, out / "precision_recall.png"))
     print(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
     if maps:
         print(plots.save(_predictions(evaluator, estimator, maps), out / "predictions.png"))
@@ -138,8 +140,6 @@ def _draw(out: Path, evaluator, estimator, scores, others: dict, maps: int) -> N
 
 def _predictions(evaluator, estimator, maps: int):
     """Prediction over truth on the whole action space of test maps that fail neither nowhere nor everywhere."""
-    import numpy as np
-
     from travjax import plots
     from travjax.labelling import samples as to_show
     from travjax.traverse import unpacked

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from travjax import report
+from travjax import report, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import require
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
     batches = (labelled(batch, robot, actions, grid) for batch in source)
     maps = joined(list(options.progress(batches, total, "labelling")))
 
-    as_in_paper = not arguments.dem and options.as_in_paper(robot, actions)
+    as_in_paper = not arguments.dem and traverse.as_in_paper(robot, actions)
     table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
     config = options.configuration_json(robot, actions, grid, files=files)
     labels = save_npz(out / "labels.npz", config=config, cell_size=grid.spacing, **maps)

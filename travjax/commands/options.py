@@ -16,7 +16,6 @@ from travjax.grid import Grid
 from travjax.labelling import Batch
 from travjax.robot import Robot
 from travjax.terrain import STYLES
-from travjax.traverse import default_robot
 
 Commands = argparse._SubParsersAction
 """What `add(commands)` of a command adds its parser to."""
@@ -76,11 +75,6 @@ def configuration(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpa
         given = [str(source) for source in (arguments.robot, arguments.actions) if source]
         raise InputError(f"{' with '.join(given)}: {error}") from None
     return grid, robot, actions
-
-
-def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
-    """Whether shares of synthetic maps compare with the paper's."""
-    return robot == default_robot() and actions == ActionSpace()
 
 
 def configuration_json(robot: Robot, actions: ActionSpace, grid: Grid, **more: Any) -> str:
