@@ -117,17 +117,19 @@ class Trainer:
 
         Raises InputError when the loss is no number any more; the last checkpoint is kept.
         """
-        while self.position.phase == 1:
-            if self.position.epoch == self.config.head_epochs:
-                variables = {name: self.state[name] for name in VARIABLES}
-                self.checkpoints.save_named("heads", variables, self._meta(optimizer=0))
-                self._begin(2)
-            else:
+        try:
+            while self.position.phase == 1:
+                if self.position.epoch == self.config.head_epochs:
+                    variables = {name: self.state[name] for name in VARIABLES}
+                    self.checkpoints.save_named("heads", variables, self._meta(optimizer=0))
+                    self._begin(2)
+                else:
+                    self._train_epoch()
+            while self.position.epoch < self.config.epochs:
                 self._train_epoch()
-        while self.position.epoch < self.config.epochs:
-            self._train_epoch()
-        if self.log:
-            self.log.close()
+        finally:
+            if self.log:
+                self.log.close()
 
     def _begin(self, phase: int) -> None:
         """A new optimizer, for what the phase trains."""
