@@ -3,6 +3,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 PRESET ?= laptop
+EXTRAS ?= dev
 TRAVJAX_DATA ?= $(wildcard ../shared/data)
 YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
 export TRAVJAX_DATA
@@ -14,6 +15,7 @@ help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
 	@echo "make label   make and label 200 synthetic maps and the Mars Yard, into $(OUT)/label"
 	@echo "make train   train the estimator and evaluate it, into $(OUT)/train/$(PRESET); PRESET=smoke|laptop|paper ($(PRESET))"
+	@echo "             on an NVIDIA GPU: make clean, then make train PRESET=paper EXTRAS=dev,cuda"
 	@echo "make test    run the tests"
 	@echo "make check   lint, types and layering"
 	@echo "make bench   measure speed, into $(OUT)/bench"
@@ -31,7 +33,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	  exit 2; fi; \
 	echo "Setting up $(VENV) with $$found, about a minute ..."; \
 	rm -rf $(VENV) && $$found -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	@touch $@
 
 label: setup
@@ -48,7 +50,7 @@ train: setup
 	$(BIN)/travjax train experiments/train/$(PRESET).toml --resume --out $(OUT)/train/$(PRESET)
 	$(BIN)/travjax evaluate $(OUT)/train/$(PRESET)
 	@echo
-	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=paper (a GPU)."
+	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
 	@echo "Another robot: $(BIN)/travjax train experiments/train/$(PRESET).toml --robot husky_a200 --out DIR"
 
 test: setup

@@ -239,7 +239,8 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_notice(tmp_path, damage):
     restored, meta = checkpoints.restore(state_of(0))
     require_equal(restored, state_of(1))
     assert meta == meta_of(1)
-    (notice,) = checkpoints.notices
+    notice, used = checkpoints.notices
+    assert used == f"{tmp_path}/000001-step-1: is used instead"
     assert notice.startswith(f"{tmp_path}/000002-step-2: damaged checkpoint passed over: ")
     assert len(notice.splitlines()) == 1
 
@@ -540,7 +541,7 @@ TWO_PROCESSES = """
     multihost_utils.sync_global_devices("damaged")
     state, meta = checkpoints.restore(state_of(0))
     require_equal(state, state_of(2))
-    assert len(checkpoints.notices) == 1
+    assert len(checkpoints.notices) == 2
     try:
         Checkpoints(folder / "file").save(1, state_of(1), {})
     except InputError as error:

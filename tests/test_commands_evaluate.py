@@ -84,9 +84,9 @@ def test_the_sample_is_described(done, trained):
     sample = results(done)["sample"]
     wanted = {"checkpoint": "latest", "samples": 108, "maps": 6, "test_maps": 6, "trajectories": 18}
     assert sample == sample | wanted
-    assert (sample["position"]["phase"], sample["position"]["total"]) == (2, 28)
+    assert (sample["phase"], sample["steps"]) == (2, 28)
     assert sample["robot"] == HUSKY.name
-    assert "108 samples of 6 of 6 test maps, Husky A200; checkpoint latest" in done.out
+    assert "108 samples of 6 of 6 test maps, Husky A200; checkpoint latest: phase 2, step 28\n" in done.out
 
 
 def test_the_tables_are_printed_and_written(done):
@@ -111,7 +111,7 @@ def test_the_baselines_stand_beside_the_network(done, truth):
 def test_the_heads_of_the_first_phase_are_the_checkpoint_of_that_name(done, trained, tmp_path):
     heads = evaluated(tmp_path, trained, "--maps", 0, "--each", 0, "--checkpoint", "heads")
     assert results(heads)["network"]["average_precision"] == results(done)[BASELINES[0]]["average_precision"]
-    assert results(heads)["sample"]["position"]["phase"] == 1
+    assert results(heads)["sample"]["phase"] == 1
 
 
 def test_the_figures_open(done):
@@ -147,7 +147,8 @@ def test_the_same_again_is_the_same(trained, tmp_path):
 
 def test_the_best_checkpoint_is_that_of_the_run(trained, tmp_path):
     wanted = load_meta(trained / "checkpoints", "best")["position"]
-    assert results(evaluated(tmp_path, trained))["sample"]["position"] == wanted
+    sample = results(evaluated(tmp_path, trained))["sample"]
+    assert (sample["phase"], sample["steps"]) == (wanted["phase"], wanted["total"])
 
 
 def test_a_run_s_own_data_set_and_folder_need_not_be_named(trained, tmp_path):
@@ -231,4 +232,5 @@ def test_a_damaged_checkpoint_is_passed_over_with_a_notice(trained, tmp_path):
     words = ("--data", trained.parent / "set", "--checkpoint", "latest", "--figure-maps", 0, "--no-baselines")
     done = succeeds(tmp_path / "out", "evaluate", folder, *words)
     assert f"{last}: damaged checkpoint passed over: meta.json is missing" in done.out
-    assert results(done)["sample"]["position"]["total"] == 27
+    assert results(done)["sample"]["steps"] == 27
+    assert "checkpoint latest: phase 2, step 27\n" in done.out

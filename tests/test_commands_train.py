@@ -102,7 +102,7 @@ def test_everything_that_is_written_is_printed(trained):
     assert {path.name for path in trained.iterdir()} == names
     out = (trained.parent / "out.txt").read_text()
     assert printed_files(Done(0, out, "", trained)) == {trained / name for name in names - {"run.json"}}
-    assert f"\nNext: travjax evaluate {trained}\n" in out
+    assert f"\nNext: travjax evaluate {trained} --data {trained.parent / 'set'}\n" in out
     for name in ("inputs.png", "training.png"):
         Image.open(trained / name).verify()
 
@@ -264,8 +264,7 @@ def test_a_run_does_not_go_on_with_another_preset(trained, tmp_path, words, line
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (("--robot", "leo_rover"), "preset.robot = 'leo_rover': must be 'husky_a200', as in the run so far"),
-        (("--weights", "w.npz"), "preset.weights = 'w.npz': must be 'none', as in the run so far"),
+        (("--robot", "leo_rover"), "robot.name = 'Leo Rover': must be 'Husky A200', as in the run so far"),
         (("--seed", 3), "preset.dataset.seed = 3: must be 5, as in the run so far"),
         (("--size", 5), "grid.size = 5.0: must be 4.0, as in the run so far"),
     ],
@@ -358,3 +357,13 @@ def test_a_data_set_in_the_folder_that_was_made_from_something_else_is_not_train
     line = refusal((*words[:2], *words[4:], "--out", folder))
     assert f"data set {folder / 'data'}" in line and "seed=6" in line and "seed=5" in line and "remove it" in line
     assert not (folder / "checkpoints").exists()
+
+
+def test_a_run_does_not_go_on_with_another_data_set(trained, tmp_path, words):
+    other = replace(dataset(), labels=np.roll(dataset().labels, 1, axis=1))
+    save(other, tmp_path / "other")
+    assert words[2] == "--data"
+    said = refusal(
+        (*words[:2], "--data", tmp_path / "other", *words[4:], "--out", copy(trained, tmp_path / "run"), "--resume")
+    )
+    assert said.startswith(f"data set = '{other.fingerprint}': must be {dataset().fingerprint}, the one that")

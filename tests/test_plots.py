@@ -281,9 +281,9 @@ def test_predictions_have_three_colours_over_the_truth_with_two_and_unknown(tmp_
     image = pixels(figure, tmp_path)
     drawn = {event: [paths(ax) for (ax,) in of_event(figure, event)] for event in EVENTS}
     assert drawn == {
-        "step": [{"safe": 15, "doubtful": 7, "failed": 14}, {"unknown": 8, "safe": 22, "failed": 6}],
-        "obstacle": [{"doubtful": 36}, {"unknown": 8, "safe": 28}],
-        "tilt": [{"failed": 36}, {"unknown": 8, "failed": 28}],
+        "step": [{"unknown": 8, "safe": 7, "doubtful": 7, "failed": 14}, {"unknown": 8, "safe": 22, "failed": 6}],
+        "obstacle": [{"unknown": 8, "doubtful": 28}, {"unknown": 8, "safe": 28}],
+        "tilt": [{"unknown": 8, "failed": 28}, {"unknown": 8, "failed": 28}],
     }
     (above,), (below,) = of_event(figure, "step")
     assert above.get_title() == "step, predicted: 50.0% of known fail"
@@ -312,7 +312,7 @@ def test_predicted_maps_stand_below_each_other_each_with_its_own_predictions(tmp
     pixels(figure, tmp_path)
     for event in EVENTS:
         above, below = of_event(figure, event)
-        assert [set(paths(ax)) for ax in above] == [{"safe"}, {"doubtful"}, {"failed"}]
+        assert [set(paths(ax)) for ax in above] == [{"safe"}, {"doubtful"}, {"unknown"}]
         assert [set(paths(ax)) for ax in below] == [{"safe"}, {"failed"}, {"unknown"}]
         assert [ax.get_title() for ax in (above[2], below[2])] == [
             f"{event}, predicted: all unknown",

@@ -398,7 +398,6 @@ def test_a_damaged_newest_checkpoint_is_passed_over_with_a_notice(trained, tmp_p
     said = capsys.readouterr()
     assert f"{newest(folder)}: damaged checkpoint passed over: " in said.out + said.err
     assert (made.position.total, made.position.step) == (27, 6)
-    assert rows_of(folder)[-1]["step"] == 27
     made.train()
     assert rows_of(folder) == rows_of(trained)
     require_equal(saved_state(folder), saved_state(trained))

@@ -7,12 +7,13 @@ import jax
 import numpy as np
 import pytest
 from commandline import FEW
-from training import GRID, HUSKY, PRESET, begun, copy, host, loads, require_equal, run_of, saved_state
+from training import GRID, HUSKY, PRESET, copy, host, loads, require_equal, run_of, saved_state
 
 from travjax.config import InputError
 from travjax.estimator import create, take_apart
 from travjax.parallel import Devices
-from travjax.trained import TRAINED, Run, has_checkpoint, load_estimator
+from travjax.preset import EvaluationConfig
+from travjax.trained import TRAINED, Run, load_estimator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -73,11 +74,15 @@ def test_a_setting_that_was_altered_is_named(tmp_path, place, value, message):
 # ---- Another run
 
 
+def test_what_does_not_matter_to_a_run_that_has_begun_may_differ():
+    preset = replace(PRESET, weights="w.npz", robot="./husky.toml", evaluation=EvaluationConfig(1, 1))
+    run_of().require_same(replace(run_of(), preset=preset), "the run")
+
+
 @pytest.mark.parametrize(
     ("other", "name", "values"),
     [
         (run_of(learning_rate=2e-3), "preset.training.learning_rate", ("0.002", "0.001")),
-        (replace(run_of(), preset=replace(PRESET, weights="w.npz")), "preset.weights", ("'w.npz'", "'none'")),
         (replace(run_of(), preset=replace(PRESET, elevation_scale=2.0)), "preset.elevation_scale", ("2.0", "0.5")),
         (replace(run_of(), robot=replace(HUSKY, track=0.5)), "robot.track", ("0.5", repr(HUSKY.track))),
         (replace(run_of(), actions=replace(FEW, turns=3)), "actions.turns", ("3", "2")),
@@ -153,13 +158,6 @@ def test_the_checkpoint_of_another_network_is_one_line(trained, tmp_path):
     folder = copy(trained, tmp_path / "run")
     replace(run_of(), preset=replace(PRESET, heads=replace(PRESET.heads, hidden=8))).save(folder)
     assert "other arrays than the network and optimiser have: heads/" in refusal(load_estimator, folder, "heads")
-
-
-def test_whether_there_is_a_checkpoint(trained, tmp_path):
-    assert has_checkpoint(trained, "heads") and has_checkpoint(trained, "latest") and has_checkpoint(trained, "best")
-    assert not has_checkpoint(trained, "tails") and not has_checkpoint(tmp_path, "heads")
-    begun(tmp_path)
-    assert not has_checkpoint(tmp_path, "latest")
 
 
 def test_an_estimator_that_was_loaded_can_be_used(trained):

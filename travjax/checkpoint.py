@@ -79,6 +79,8 @@ class Checkpoints:
         finally:
             self._damaged |= damaged
             self.notices = [f"{path}: damaged checkpoint passed over: {why}" for path, why in damaged.items()]
+        if damaged:
+            self.notices.append(f"{path}: is used instead")
         chosen = template(saved["meta"]) if callable(template) else template
         return _load(path, saved["arrays"], chosen), saved["meta"]
 

@@ -29,6 +29,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader of our output has gone
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:  # a name too long, no permission
+        print(f"travjax: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        return 2
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        reason = str(error).partition("\n")[0][:200]
+        print(f"travjax: out of memory: {reason}; try fewer maps or a smaller batch_size", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("travjax: interrupted", file=sys.stderr)
         return 130

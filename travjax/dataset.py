@@ -14,6 +14,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.metadata import version
 from numbers import Integral
 from pathlib import Path
@@ -73,7 +74,7 @@ class DatasetConfig:
     def seeds(self) -> np.ndarray:
         """The terrain seed of each map: [n] uint32, all different.
 
-        Data sets of another seed or size have other maps, so that no test map of one is a training map of another.
+        Data sets of another seed or size have practically no map in common.
         """
         spare = 64 + self.maps // 16  # for the few that come twice
         keys = random_keys(("terrain", (self.seed, self.maps)), np.arange(self.maps + spare)) >> np.uint64(32)
@@ -154,6 +155,14 @@ class Dataset:
         unknown = self.group[~np.isin(self.group, STYLES)] if self.config else self.group[:0]
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(STYLES)}")
 
+    @cached_property
+    def fingerprint(self) -> str:
+        """Tells data sets apart: a hash of labels, seeds, groups and splits."""
+        digest = hashlib.sha256("\n".join(self.group).encode())
+        for array in (self.labels, self.seed, self.split):
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()[:16]
+
     def maps_of(self, split: str) -> np.ndarray:
         """Indices of the maps of "train", "validation" or "test": [k]."""
         require(split in SPLITS, "split", split, f"one of {', '.join(SPLITS)}")
@@ -213,7 +222,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
     on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
     or when it cannot be written: a full disk, no permission.
     """
-    with folder_written_whole(Path(folder), _is_dataset) as temporary:
+    with folder_written_whole(Path(folder), is_dataset) as temporary:
         arrays = {f"{name}.npy": getattr(dataset, name) for name in ARRAYS}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
@@ -294,7 +303,7 @@ def _digest(table: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(table, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
-def _is_dataset(folder: Path) -> bool:
+def is_dataset(folder: Path) -> bool:
     """Whether the folder holds a data set of any version and nothing else."""
     try:
         table = json.loads((folder / "dataset.json").read_text())

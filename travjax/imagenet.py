@@ -138,7 +138,7 @@ def load_weights(path: str | Path, config: ResNetConfig = ResNetConfig()) -> Wei
     try:
         found, notes = read_arrays(path)
         naming, expected = _recognised(found, config)
-        _check(found, naming, expected)
+        _check(found, naming, expected, config)
         stride_in, epsilon = notes.get("stride_in", naming.stride_in), notes.get("epsilon", naming.epsilon)
         replace(config, stride_in=stride_in, epsilon=epsilon)  # raises InputError unless they are allowed
         return Weights(
@@ -185,12 +185,12 @@ def _recognised(found: dict, config: ResNetConfig) -> tuple[_Naming, dict[str, t
     candidates = [(naming, expected(naming)) for naming in _NAMINGS]
     naming, wanted = max(candidates, key=lambda candidate: len(candidate[1].keys() & found.keys()))
     if not wanted.keys() & found.keys():
-        known = ", ".join(naming.name("conv1", "kernel") for naming in _NAMINGS)
+        known = ", ".join(dict.fromkeys(naming.name("conv1", "kernel") for naming in _NAMINGS))
         raise InputError(f"no array of a ResNet among its {len(found)}; allowed names are, for the first: {known}")
     return naming, wanted
 
 
-def _check(found: dict[str, np.ndarray], naming: _Naming, expected: dict) -> None:
+def _check(found: dict[str, np.ndarray], naming: _Naming, expected: dict, config: ResNetConfig) -> None:
     """Raises InputError that names whatever does not fit."""
     wrong = [f"{name} is missing" for name in expected if name not in found]
     wrong += [f"{name} is unexpected" for name in found if name not in expected]
@@ -208,7 +208,8 @@ def _check(found: dict[str, np.ndarray], naming: _Naming, expected: dict) -> Non
     if wrong:
         more = f"; and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         count = f"{len(wrong)} array{'s' if len(wrong) > 1 else ''}"
-        raise InputError(f"{count} of {naming.title} naming wrong: {'; '.join(wrong[:SHOWN])}{more}")
+        size = f"a trunk of blocks {list(config.blocks)}, width {config.width}"
+        raise InputError(f"{count} of {naming.title} naming wrong for {size}: {'; '.join(wrong[:SHOWN])}{more}")
 
 
 def _stored(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -271,6 +272,7 @@ def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:
         import huggingface_hub
     except ImportError:
         raise InputError("fetching weights needs huggingface_hub: pip install huggingface_hub") from None
+    huggingface_hub.utils.logging.set_verbosity_error()  # it says each time that it tries again
     try:
         return Path(huggingface_hub.hf_hub_download(repository, filename))
     except Exception as error:  # of whichever HTTP client it uses

@@ -116,7 +116,7 @@ def predicted_maps(
         for event, name in enumerate(EVENTS):
             predicted, fails = probabilities[one, :, event], failed[one, :, event]
             for ax, what, mask, by_colour in (
-                (above[event], "predicted", predicted >= FAILURE, _by_probability(predicted)),
+                (above[event], "predicted", predicted >= FAILURE, _by_probability(predicted, known[one])),
                 (below[event], "true", fails, _by_label(fails, known[one])),
             ):
                 _draw_elevation(ax, heights[one], grid, *_colour_range(heights[one]), colour="gray", alpha=0.35)
@@ -167,9 +167,9 @@ def _by_label(failed: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
     return {UNKNOWN: ~known, SAFE: known & ~failed, FAILED: known & failed}
 
 
-def _by_probability(probability: np.ndarray) -> dict[str, np.ndarray]:
-    failing = probability >= FAILURE
-    return {SAFE: probability < DOUBT, DOUBTFUL: (probability >= DOUBT) & ~failing, FAILED: failing}
+def _by_probability(probability: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
+    failing, safe = probability >= FAILURE, probability < DOUBT
+    return {UNKNOWN: ~known, SAFE: known & safe, DOUBTFUL: known & ~safe & ~failing, FAILED: known & failing}
 
 
 def _draw_paths(ax, paths: np.ndarray, by_colour: dict[str, np.ndarray]) -> None:

@@ -49,13 +49,19 @@ def over_samples(
     on_progress: is told how many samples were added
     """
     count = len(samples[0])
-    results: list[np.ndarray] = []
+    results: list[np.ndarray] = []  # one array, filled batch by batch
+    filled = 0
     running: list[tuple[int, jax.Array]] = []
 
     def collect(most: int) -> None:
+        nonlocal filled
         while len(running) > most:
             size, result = running.pop(0)
-            results.append(devices.fetch(result)[:size])
+            batch = devices.fetch(result)
+            if not results:
+                results.append(np.empty((count, *batch.shape[1:]), batch.dtype))
+            results[0][filled : filled + size] = batch[:size]
+            filled += size
             on_progress(size)
 
     for start in range(0, count, batch_size):
@@ -63,7 +69,7 @@ def over_samples(
         running.append((min(batch_size, count - start), function(graph, variables, source, *devices.shard(batch))))
         collect(2)  # the device works while the host fetches
     collect(0)
-    return np.concatenate(results)
+    return results[0]
 
 
 def probabilities(logits: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -1,6 +1,8 @@
 """What a training run reports: metrics.jsonl, a line for each report, and TensorBoard."""
 
 import json
+import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +18,29 @@ class RunLog:
     """
 
     def __init__(self, folder: Path, step: int = 0):
-        from tensorboardX import SummaryWriter
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto.event_pb2 import Event, SessionLog
 
         self.path = folder / "metrics.jsonl"
         kept = [row for row in read_rows(self.path) if row["step"] <= step] if step else []
         with written_whole(self.path) as temporary:
             temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
+        board = folder / "tensorboard"
         try:
-            self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1 if step else None)
+            board.mkdir(exist_ok=True)
+            # SummaryWriter writes from a thread, which dies over a full disk and lets its caller wait for ever.
+            self._board = EventsWriter(str(board / "events"))
+            if step:
+                later = SessionLog(status=SessionLog.START)
+                self._board.write_event(Event(wall_time=time.time(), step=step + 1, session_log=later))
         except OSError as error:
-            raise InputError(f"{folder / 'tensorboard'}: cannot be written: {error.strerror}") from None
+            raise InputError(f"{board}: cannot be written: {error.strerror}") from None
 
     def write(self, row: dict[str, Any]) -> None:
         """Appends a row; a dict in it is a group of numbers."""
+        from tensorboardX.proto.event_pb2 import Event
+        from tensorboardX.summary import scalar
+
         try:
             with self.path.open("a") as file:
                 file.write(json.dumps(row, allow_nan=False) + "\n")
@@ -36,12 +48,16 @@ class RunLog:
                 inner = value if isinstance(value, dict) else {"": value}
                 for name, number in inner.items():
                     if isinstance(number, int | float):
-                        self._board.add_scalar(f"{key}/{name}".rstrip("/"), number, row["step"])
+                        summary = scalar(f"{key}/{name}".rstrip("/"), number)
+                        self._board.write_event(Event(wall_time=time.time(), step=row["step"], summary=summary))
+            self._board.flush()
         except OSError as error:
             raise InputError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def close(self) -> None:
-        self._board.close()
+        """Closes the files; a full disk was reported when the last row was written."""
+        with suppress(OSError):
+            self._board.close()
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:

@@ -1,6 +1,6 @@
 """Which (map, trajectory) pairs to train on: balanced subsets, natural samples and shuffled batches (SPEC section 7).
 
-Everything here is NumPy on the host and cheap: a balanced subset of the paper's 51,157 training maps takes seconds, so
+Everything here is NumPy on the host and cheap: a balanced subset of the paper's 51,157 training maps takes a second, so
 that a fresh one can be drawn for each epoch. Samples are a pair of int32 arrays (map_index, trajectory_index). Labels
 are [n, t], one byte a trajectory as traverse.py packs them.
 

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from travjax import metrics
 from travjax.checkpoint import Checkpoints
-from travjax.config import InputError
+from travjax.config import InputError, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import VARIABLES, Estimator, take_apart
 from travjax.inputs import ImageSource, trajectory_bank
@@ -32,7 +32,6 @@ from travjax.sampling import Samples
 from travjax.trained import TRAINED, Run
 from travjax.training_data import TrainingData
 from travjax.training_step import State, is_finite, update
-from travjax.traverse import EVENTS
 
 IN_FLIGHT = 2
 """Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
@@ -77,6 +76,7 @@ class Trainer:
         self.position = Position()
         self._optimizers: dict[int, optax.GradientTransformation] = {}
         self.graph = run.graph()
+        self.log: RunLog | None = None
 
     @cached_property
     def source(self) -> ImageSource:
@@ -98,25 +98,29 @@ class Trainer:
         variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
         self.state: State = self.devices.replicate(variables)
         self._begin(1 if self.config.head_epochs else 2)
-        self._open_log()
 
     def resume(self) -> None:
         """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
 
-        Raises InputError when there is none.
+        Raises InputError when there is none, or it was trained on another data set.
         """
         template = lambda meta: self.run.template(meta["optimizer"], self.devices.everywhere)
         self.state, meta = self.checkpoints.restore(template)
+        trained_on, given = meta["dataset"], self.data.dataset.fingerprint
+        require(trained_on == given, "data set", given, f"{trained_on}, the one that the run was trained on so far")
         self.position = Position(**meta["position"])
         for notice in self.checkpoints.notices:
             self._say(notice)
-        self._open_log()
+        here = self.position
+        self._say(f"goes on from step {here.total}: phase {here.phase}, epoch {here.epoch + 1}, batch {here.step + 1}")
 
     def train(self) -> None:
         """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
 
         Raises InputError when the loss is no number any more; the last checkpoint is kept.
         """
+        if self.devices.main:
+            self.log = RunLog(self.folder, self.position.total)
         try:
             while self.position.phase == 1:
                 if self.position.epoch == self.config.head_epochs:
@@ -256,10 +260,11 @@ class Trainer:
 
     def _meta(self, optimizer: int) -> dict[str, Any]:
         """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
-        return {"position": asdict(self.position), "optimizer": optimizer}
-
-    def _open_log(self) -> None:
-        self.log = RunLog(self.folder, self.position.total) if self.devices.main else None
+        return {
+            "position": asdict(self.position),
+            "optimizer": optimizer,
+            "dataset": self.data.dataset.fingerprint,
+        }
 
     def _report(self, row: dict[str, Any]) -> None:
         here = self.position
@@ -280,7 +285,7 @@ class Trainer:
 
 def _summary(here: Position, row: dict[str, Any], best: bool) -> str:
     shown = lambda value: "-" if value is None else f"{value:.3f}"
-    precision = ", ".join(f"{event} {shown(row['average_precision'][event])}" for event in EVENTS)
+    precision = ", ".join(f"{name} {shown(row['average_precision'][name])}" for name in metrics.NAMES)
     losses = f"loss {row['loss']:.3f}, validation {row['validation_loss']:.3f} (constant {row['constant_loss']:.3f})"
     rate = f"{row['samples_per_s']:.0f} samples/s"
     star = ", best so far" if best else ""

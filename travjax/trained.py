@@ -10,7 +10,7 @@ import jax
 from flax import nnx
 
 from travjax.actions import ActionSpace
-from travjax.checkpoint import Checkpoints, load_meta
+from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, from_json, to_json
 from travjax.estimator import Estimator, create, put_together, take_apart
 from travjax.files import written_whole
@@ -20,6 +20,9 @@ from travjax.robot import Robot
 
 TRAINED = {1: ("heads",), 2: ("trunk", "heads")}
 """What each phase trains."""
+
+DATA = "data"
+"""Folder of a run's own data set."""
 
 _PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
 
@@ -62,8 +65,9 @@ class Run:
 
     def require_same(self, other: "Run", what: str) -> None:
         """Raises InputError that names the first setting in which the other run differs."""
+        free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.each")}
         for name, mine, others in _settings(self, other):
-            if mine != others:
+            if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {others!r}: must be {mine!r}, as in the run so far")
 
     def graph(self) -> nnx.GraphDef:
@@ -105,12 +109,3 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Estima
     for notice in checkpoints.notices:
         print(notice)
     return run, put_together(run.graph(), state), meta
-
-
-def has_checkpoint(folder: str | Path, name: str) -> bool:
-    """Whether a run has such a checkpoint."""
-    try:
-        load_meta(Path(folder) / "checkpoints", name)
-    except InputError:
-        return False
-    return True

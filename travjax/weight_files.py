@@ -36,7 +36,8 @@ def read_arrays(path: Path) -> tuple[Arrays, dict]:
     except InputError:
         raise
     except Exception as error:  # libraries raise all sorts over a damaged file
-        reason = (getattr(error, "strerror", None) or str(error) or type(error).__name__).splitlines()[0]
+        text = (getattr(error, "strerror", None) or str(error)).partition("\n")[0]
+        reason = text if " " in text else f"{type(error).__name__} {text}".strip()
         raise InputError(f"cannot be read as {suffix}, damaged or something else: {reason}") from None
 
 

@@ -9,7 +9,7 @@ from travjax import tfds_builder, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import InputError, require
-from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, save
+from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, is_dataset, load, save
 from travjax.files import output_folder, written_whole
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -105,6 +105,8 @@ def _require_free(folder: Path) -> None:
         empty = not folder.exists() or folder.is_dir() and not any(folder.iterdir())
     except OSError as error:
         raise InputError(f"--out {folder}: cannot be read: {error.strerror or error}") from None
-    if not empty and not (folder / "dataset.json").is_file():
+    if not empty and not is_dataset(folder):
         raise InputError(f"--out {folder}: holds something else: must be a new or empty folder, or that of a data set")
+    if not empty:
+        tqdm.write(f"{folder}: the data set there will be replaced")
     output_folder(folder.parent)

@@ -8,8 +8,7 @@ import numpy as np
 from tqdm import tqdm
 
 from travjax.commands import options
-from travjax.commands.train import DATA
-from travjax.config import require
+from travjax.config import InputError, require
 from travjax.files import output_folder, written_whole
 
 CALIBRATION = (
@@ -38,7 +37,12 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument("--figure-maps", type=int, default=2, metavar="N", help="maps in predictions.png (2)")
     parser.add_argument("--no-baselines", action="store_true", help="without the two predictors to beat")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write to (RUN/evaluation)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder to write to (RUN/evaluation, and RUN/evaluation_C for another checkpoint than best)",
+    )
     parser.set_defaults(run=run)
 
 
@@ -47,12 +51,13 @@ def run(arguments: argparse.Namespace) -> None:
     from travjax import dataset
     from travjax.evaluate import Evaluator
     from travjax.parallel import Devices
-    from travjax.trained import load_estimator
+    from travjax.trained import DATA, load_estimator
 
     _check(arguments)
     trained, estimator, meta = load_estimator(arguments.folder, arguments.checkpoint)
     evaluator = Evaluator.of(trained, dataset.load(arguments.data or arguments.folder / DATA), Devices.all())
-    out = output_folder(arguments.out or arguments.folder / "evaluation")
+    name = "evaluation" if arguments.checkpoint == "best" else f"evaluation_{arguments.checkpoint}"
+    out = output_folder(arguments.out or arguments.folder / name)
     sampled = trained.preset.evaluation
     maps = sampled.maps if arguments.maps is None else arguments.maps
     samples = evaluator.samples(maps, sampled.each if arguments.each is None else arguments.each)
@@ -80,12 +85,16 @@ def _probabilities(evaluator, estimator, samples, what: str):
 
 def _baselines(folder: Path, evaluator, samples, recalls) -> dict:
     """Evaluations of the predictors to beat: heads on the trunk as it was, and a regression on the ground alone."""
-    from travjax.trained import has_checkpoint, load_estimator
+    from travjax.trained import load_estimator
 
     others = {}
-    if has_checkpoint(folder, "heads"):
-        heads = load_estimator(folder, "heads")[1]
-        others["heads on the frozen trunk"] = _probabilities(evaluator, heads, samples, "frozen trunk")
+    if evaluator.run.preset.training.head_epochs:
+        try:
+            heads = load_estimator(folder, "heads")[1]
+        except InputError as error:
+            tqdm.write(f"{error}; left out")
+        else:
+            others["heads on the frozen trunk"] = _probabilities(evaluator, heads, samples, "frozen trunk")
     others["regression on slope and step"] = evaluator.regression(samples)
     return {name: evaluator.scores(values, samples, recalls) for name, values in others.items()}
 
@@ -95,7 +104,8 @@ def _description(evaluator, samples, arguments: argparse.Namespace, meta: dict) 
     trained, data = evaluator.run, evaluator.dataset
     return {
         "checkpoint": arguments.checkpoint,
-        "position": meta["position"],
+        "phase": meta["position"]["phase"],
+        "steps": meta["position"]["total"],
         "samples": len(samples[0]),
         "maps": len(np.unique(samples[0])),
         "test_maps": len(data.maps_of("test")),
@@ -110,8 +120,9 @@ def _write_tables(out: Path, scores, others: dict, description: dict, paper) -> 
 
     average_precisions = {"network": scores.average_precision}
     average_precisions |= {name: other.average_precision for name, other in others.items()}
+    headline = "{samples} samples of {maps} of {test_maps} test maps, {robot}; checkpoint {checkpoint}: phase {phase}, "
     tables = [
-        "{samples} samples of {maps} of {test_maps} test maps, {robot}; checkpoint {checkpoint}".format(**description),
+        (headline + "step {steps}").format(**description),
         report.metrics_table(scores, paper),
         report.threshold_table(scores, paper),
         CALIBRATION,

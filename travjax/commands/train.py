@@ -10,9 +10,6 @@ from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder
 
-DATA = "data"
-"""Folder of a run's own data set."""
-
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
@@ -34,7 +31,9 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--resume", action="store_true", help="go on from the latest checkpoint in --out, if there is one"
     )
-    options.add_out(parser, "runs/train/PRESET")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write to (runs/train/ and the preset's name)"
+    )
     group = parser.add_argument_group("several processes that train together")
     group.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
     group.add_argument("--processes", type=int, metavar="N", help="how many there are")
@@ -55,7 +54,7 @@ def run(arguments: argparse.Namespace) -> None:
     folder, wanted = _folder(arguments), _wanted(arguments)
     _check_folder(folder, wanted, arguments.resume)
     devices.wait()
-    _train(arguments, wanted, output_folder(folder), devices)
+    _train(arguments, wanted, folder, devices)
 
 
 def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None:
@@ -68,19 +67,21 @@ def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None
     resumes = arguments.resume and _has_checkpoints(folder)
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
+    estimator = None if resumes else create(preset.trunk, preset.heads, preset.training.seed, weights)
     trainer = Trainer(wanted, _dataset(arguments, wanted, folder, devices), folder, devices)
+    output_folder(folder)
     if devices.main:
         wanted.save(folder)
         print(trainer.summary())
-    if resumes:
+    if estimator is None:
         trainer.resume()
     else:
-        trainer.start(create(preset.trunk, preset.heads, preset.training.seed, weights))
+        trainer.start(estimator)
         if devices.main:
             print(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:
-        _finish(folder)
+        _finish(folder, arguments.data)
 
 
 def _wanted(arguments: argparse.Namespace):
@@ -102,7 +103,7 @@ def _wanted(arguments: argparse.Namespace):
 
 
 def _folder(arguments: argparse.Namespace) -> Path:
-    return Path(*(arguments.preset.stem if part == "PRESET" else part for part in arguments.out.parts))
+    return arguments.out or Path("runs/train") / arguments.preset.stem
 
 
 def _check_folder(folder: Path, wanted, resume: bool) -> None:
@@ -125,10 +126,13 @@ def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
     """The data set that is given, else the run's own, made if it is not there yet."""
     from travjax import dataset
     from travjax.commands.dataset import made
+    from travjax.trained import DATA
 
     if arguments.data:
         return dataset.load(arguments.data)
     kept = folder / DATA
+    for split, size in zip(dataset.SPLITS[:2], wanted.preset.dataset.split_sizes()[:2], strict=True):
+        require(size > 0, f"[dataset] of {arguments.preset}: {split} maps", size, "at least 1: more maps, other shares")
     if devices.main and not (kept / "dataset.json").exists():
         made(wanted.preset.dataset, wanted.robot, wanted.actions, wanted.grid, kept)
     devices.wait()
@@ -156,7 +160,7 @@ def _draw_inputs(trainer, folder: Path) -> Path:
     return plots.save(curves.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png")
 
 
-def _finish(folder: Path) -> None:
+def _finish(folder: Path, data: Path | None) -> None:
     """The figure of the run, and where everything is."""
     from travjax import curves, plots
     from travjax.runlog import read_rows
@@ -166,4 +170,4 @@ def _finish(folder: Path) -> None:
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         print(path)
     print(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))
-    print(f"\nNext: travjax evaluate {folder}")
+    print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")
