@@ -14,8 +14,9 @@ from conftest import SETTINGS
 from travjax import dataset as module
 from travjax.actions import ActionSpace
 from travjax.config import InputError
-from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, folder_written_whole, generate, load, require_same
+from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, require_same
 from travjax.dataset import save as save_dataset
+from travjax.files import folder_written_whole
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import STYLES, generate_terrain

@@ -481,7 +481,7 @@ def test_a_full_disk_stops_training_and_keeps_the_earlier_checkpoints(tmp_path, 
     def filling(step, *arguments):
         saves.append(step)
         if step == 6:
-            monkeypatch.setattr(checkpoint, "_sha256", full)
+            monkeypatch.setattr(checkpoint, "sha256", full)
         save(step, *arguments)
 
     made.checkpoints.save = filling

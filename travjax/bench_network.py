@@ -16,7 +16,7 @@ from travjax.actions import ActionSpace
 from travjax.dataset import DatasetConfig, generate
 from travjax.estimator import VARIABLES, create, take_apart
 from travjax.grid import Grid
-from travjax.inputs import ImageSource, trajectory_bank
+from travjax.inputs import ImageSource
 from travjax.parallel import Devices
 from travjax.prediction import over_samples, sample_logits
 from travjax.preset import TrainingConfig
@@ -52,8 +52,7 @@ class Bench:
     ):
         self.repeats, self.devices = repeats, Devices.all()
         self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
-        bank = trajectory_bank(robot, actions, grid)
-        self.source = self.devices.replicate(ImageSource(self.dataset.heights, bank, np.float32(1)))
+        self.source = self.devices.replicate(ImageSource.of(self.dataset.heights, robot, actions, grid, 1.0))
         self.graph, self.variables = take_apart(create(trunk))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 

@@ -10,7 +10,6 @@ A folder holds one sub-folder a checkpoint, numbered in the order they were save
 A checkpoint is written to a temporary folder and renamed: a kill at any moment leaves the earlier ones as they were.
 """
 
-import hashlib
 import json
 import logging
 import os
@@ -29,6 +28,7 @@ from flax.traverse_util import unflatten_dict
 from jax.experimental import multihost_utils
 
 from travjax.config import InputError, require
+from travjax.files import sha256
 
 FORMAT = 1
 UNFINISHED = ".unfinished-checkpoint"
@@ -102,7 +102,7 @@ class Checkpoints:
 
         def finish() -> None:
             (unfinished / "meta.json").write_text(text)
-            sums = [f"{_sha256(file)}  {name}\n" for name, file in _files(unfinished).items()]
+            sums = [f"{sha256(file)}  {name}\n" for name, file in _files(unfinished).items()]
             (unfinished / "SHA256SUMS").write_text("".join(sums))
             number = max((number for number, _, _ in _checkpoints(self.folder)), default=0) + 1
             unfinished.rename(self.folder / f"{number:06d}-{label}")
@@ -194,7 +194,7 @@ def _checked(path: Path, arrays: bool) -> dict:
         for name in sorted(sums.keys() ^ files.keys()):
             raise _Damaged(f"{name} is {'missing' if name in sums else 'not in SHA256SUMS'}")
         for name in sums if arrays else ["meta.json"]:
-            if _sha256(files[name]) != sums[name]:
+            if sha256(files[name]) != sums[name]:
                 raise _Damaged(f"{name} is altered or truncated")
         saved = json.loads((path / "meta.json").read_text())
     except OSError as error:
@@ -209,11 +209,6 @@ def _checked(path: Path, arrays: bool) -> dict:
 def _files(path: Path) -> dict[str, Path]:
     files = sorted(file for file in path.rglob("*") if not file.is_dir() and file.name != "SHA256SUMS")
     return {file.relative_to(path).as_posix(): file for file in files}
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _named_leaves(tree: PyTree) -> dict[str, Any]:

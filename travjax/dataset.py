@@ -8,11 +8,8 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
-import shutil
 import textwrap
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -24,6 +21,7 @@ import numpy as np
 
 from travjax.actions import ActionSpace
 from travjax.config import InputError, from_json, require, require_number, to_json
+from travjax.files import folder_written_whole, sha256
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -263,17 +261,16 @@ def _read_table(path: Path) -> dict[str, Any]:
     return table
 
 
-def _verify(path: Path, size: int, sha256: str) -> None:
+def _verify(path: Path, size: int, expected: str) -> None:
     try:
         found = path.stat().st_size
         if found != size:
             raise InputError(f"{path}: {found} bytes: must be {size}; it was truncated or overwritten")
-        with path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
+        digest = sha256(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    if digest != sha256:
-        raise InputError(f"{path}: has been altered: its SHA-256 is {digest[:12]}..., and was {sha256[:12]}...")
+    if digest != expected:
+        raise InputError(f"{path}: has been altered: its SHA-256 is {digest[:12]}..., and was {expected[:12]}...")
 
 
 class _Hashing:
@@ -311,32 +308,3 @@ def is_dataset(folder: Path) -> bool:
         return table["format"] == FORMAT and {path.name for path in folder.iterdir()} <= ours
     except (OSError, ValueError, TypeError, KeyError):
         return False
-
-
-@contextmanager
-def folder_written_whole(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary folder beside `folder` to write to; it becomes `folder` when the block ends well, else it is removed.
-
-    Raises InputError when it cannot be written, or when a file or a folder that is not `replaceable` lies there.
-    """
-    place = folder.resolve()
-    temporary, aside = (place.with_name(f".{os.getpid()}-{mark}{place.name}") for mark in ("", "old-"))
-    try:
-        taken = place.exists() and not (place.is_dir() and (not any(place.iterdir()) or replaceable(place)))
-        if taken:
-            raise InputError(
-                f"{folder}: holds something else: must be a new or empty folder, or an older one of its kind"
-            )
-        place.parent.mkdir(parents=True, exist_ok=True)
-        temporary.mkdir()
-        yield temporary
-        if place.exists():
-            place.rename(aside)
-        temporary.rename(place)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if aside.exists() and not place.exists():
-            aside.rename(place)
-        shutil.rmtree(aside, ignore_errors=True)

@@ -4,7 +4,6 @@ Files are brought to one convention: row 0 is the southernmost, column 0 the wes
 centre. GeoTIFF and whatever else rasterio reads run from north to south and are flipped; .npy and .npz are as grid.py.
 """
 
-import hashlib
 import warnings
 import zipfile
 import zlib
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from travjax.config import InputError, require, require_number
+from travjax.files import sha256
 from travjax.grid import HIGHEST, Grid
 
 FILL_DISTANCE = 0.125
@@ -106,8 +106,7 @@ def load_dem(
         rasters = [_checked(raster, grid, allow_coarse) for raster in _read(path, cell_size, height_scale, nodata)]
         offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round()) + 0.0
         parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
-        with path.open("rb") as file:
-            checksum = hashlib.file_digest(file, "sha256").hexdigest()
+        checksum = sha256(path)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     except OSError as error:

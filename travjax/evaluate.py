@@ -10,7 +10,7 @@ from travjax.baselines import LogisticRegression, slope_and_step
 from travjax.config import require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import Estimator, take_apart
-from travjax.inputs import ImageSource, trajectory_bank
+from travjax.inputs import ImageSource
 from travjax.parallel import Devices
 from travjax.prediction import over_samples, probabilities, sample_logits
 from travjax.sampling import Samples, balanced_subset, every_sample, natural_sample
@@ -41,8 +41,8 @@ class Evaluator:
         """Puts the images' parts on the devices."""
         require_same(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
-        bank = trajectory_bank(run.robot, run.actions, run.grid)
-        source = ImageSource(dataset.heights, bank, np.float32(run.preset.elevation_scale))
+        scale = run.preset.elevation_scale
+        source = ImageSource.of(dataset.heights, run.robot, run.actions, run.grid, scale)
         return Evaluator(run, dataset, devices.replicate(source), devices)
 
     def samples(self, maps: int, each: int) -> Samples:

@@ -1,7 +1,9 @@
 """Files that are written whole or not at all."""
 
+import hashlib
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,6 +28,35 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def folder_written_whole(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
+    """A temporary folder beside `folder` to write to; it becomes `folder` when the block ends well, else it is removed.
+
+    Raises InputError when it cannot be written, or when a file or a folder that is not `replaceable` lies there.
+    """
+    place = folder.resolve()
+    temporary, aside = (place.with_name(f".{os.getpid()}-{mark}{place.name}") for mark in ("", "old-"))
+    try:
+        taken = place.exists() and not (place.is_dir() and (not any(place.iterdir()) or replaceable(place)))
+        if taken:
+            raise InputError(
+                f"{folder}: holds something else: must be a new or empty folder, or an older one of its kind"
+            )
+        place.parent.mkdir(parents=True, exist_ok=True)
+        temporary.mkdir()
+        yield temporary
+        if place.exists():
+            place.rename(aside)
+        temporary.rename(place)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if aside.exists() and not place.exists():
+            aside.rename(place)
+        shutil.rmtree(aside, ignore_errors=True)
+
+
 def output_folder(path: str | Path) -> Path:
     """Creates the folder if need be. Raises InputError when it cannot be written to."""
     folder = Path(path)
@@ -39,6 +70,12 @@ def output_folder(path: str | Path) -> Path:
             f"--out {folder}: cannot be written: {error.strerror}; allowed: a folder you may write to"
         ) from None
     return folder
+
+
+def sha256(path: Path) -> str:
+    """The checksum of a file, in hexadecimal; it is read piece by piece."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cache_folder() -> Path:

@@ -103,6 +103,19 @@ class ImageSource:
     bank: UInt8[Array, "t rows cols 2"] | UInt8[np.ndarray, "t rows cols 2"]
     elevation_scale: float | np.float32
 
+    @staticmethod
+    def of(
+        heights: Float[np.ndarray, "n rows cols"],
+        robot: Robot,
+        actions: ActionSpace,
+        grid: Grid,
+        elevation_scale: float,
+        on_progress: Callable[[int], object] = lambda count: None,
+    ) -> "ImageSource":
+        """All trajectories on maps; arguments of `trajectory_bank`, whose bank it takes."""
+        bank = trajectory_bank(robot, actions, grid, on_progress=on_progress)
+        return ImageSource(heights, bank, np.float32(elevation_scale))
+
     def images(self, map_index: Int[Array, " b"], trajectory_index: Int[Array, " b"]) -> Float[Array, "b rows cols 3"]:
         """Images of samples, as `assemble` makes them."""
         return assemble(self.heights, self.bank, map_index, trajectory_index, self.elevation_scale)

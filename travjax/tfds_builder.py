@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError, require
-from travjax.dataset import SPLITS, Dataset, configs_from_json, configs_to_json, folder_written_whole
+from travjax.dataset import SPLITS, Dataset, configs_from_json, configs_to_json
+from travjax.files import folder_written_whole
 
 NAME, VERSION = "travjax", "1.0.0"
 

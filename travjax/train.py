@@ -24,7 +24,7 @@ from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import VARIABLES, Estimator, take_apart
-from travjax.inputs import ImageSource, trajectory_bank
+from travjax.inputs import ImageSource
 from travjax.parallel import Devices
 from travjax.prediction import feature_logits, over_samples, probabilities, sample_features, sample_logits
 from travjax.runlog import RunLog
@@ -83,8 +83,8 @@ class Trainer:
         """Images of all samples, on the devices."""
         run = self.run
         with self._bar("trajectory bank", len(run.actions), "trajectory") as bar:
-            bank = trajectory_bank(run.robot, run.actions, run.grid, on_progress=bar.update)
-        source = ImageSource(self.data.dataset.heights, bank, np.float32(run.preset.elevation_scale))
+            heights, scale = self.data.dataset.heights, run.preset.elevation_scale
+            source = ImageSource.of(heights, run.robot, run.actions, run.grid, scale, bar.update)
         return self.devices.replicate(source)
 
     @cached_property
@@ -124,8 +124,7 @@ class Trainer:
         try:
             while self.position.phase == 1:
                 if self.position.epoch == self.config.head_epochs:
-                    variables = {name: self.state[name] for name in VARIABLES}
-                    self.checkpoints.save_named("heads", variables, self._meta(optimizer=0))
+                    self.checkpoints.save_named("heads", self._variables, self._meta(optimizer=0))
                     self._begin(2)
                 else:
                     self._train_epoch()
@@ -141,12 +140,20 @@ class Trainer:
         self.position.phase, self.position.epoch = phase, 0
         trained = {name: self.state[name] for name in TRAINED[phase]}
         optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
-        self.state = {name: self.state[name] for name in VARIABLES} | {"optimizer": optimizer}
+        self.state = self._variables | {"optimizer": optimizer}
+
+    @property
+    def _variables(self) -> State:
+        """The state without its optimizer."""
+        return {name: self.state[name] for name in VARIABLES}
+
+    def _planned_steps(self, phase: int) -> int:
+        """Steps of a phase; with fresh samples an epoch may have one more or less."""
+        return self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
         if phase not in self._optimizers:  # the same object each time: jit compiles for it
-            steps = self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
-            self._optimizers[phase] = self.config.optimizer(phase, steps)
+            self._optimizers[phase] = self.config.optimizer(phase, self._planned_steps(phase))
         return self._optimizers[phase]
 
     def _train_epoch(self) -> None:
@@ -225,10 +232,9 @@ class Trainer:
 
     def _validated(self) -> dict[str, Any]:
         """Loss, that of the best constant predictor, average precision and F1 on the validation samples."""
-        variables = {name: self.state[name] for name in VARIABLES}
         if self.position.phase == 1:
             features = self.devices.replicate(self._features["validation"])
-            logits = self.devices.fetch(feature_logits(self.graph, variables, features))
+            logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
         else:
             logits = self._over(sample_logits, self.data.validation, "validation")
         if not np.isfinite(logits).all():
@@ -253,7 +259,7 @@ class Trainer:
         )
 
     def _over(self, function, samples: Samples, what: str) -> np.ndarray:
-        variables = {name: self.state[name] for name in VARIABLES}
+        variables = self._variables
         with self._bar(what, len(samples[0])) as bar:
             size = self.config.batch_size
             return over_samples(function, self.graph, variables, self.source, samples, self.devices, size, bar.update)
@@ -268,9 +274,8 @@ class Trainer:
 
     def _report(self, row: dict[str, Any]) -> None:
         here = self.position
-        steps = self.data.steps(here.phase)
-        schedule = self.config.schedule_of(here.phase, steps * self.config.epochs)
-        rate = float(schedule(here.epoch * steps + here.step - 1))  # of the step before
+        schedule = self.config.schedule_of(here.phase, self._planned_steps(here.phase))
+        rate = float(schedule(here.epoch * self.data.steps(here.phase) + here.step - 1))  # of the step before
         place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
         if self.log:
             self.log.write(place | row)
