@@ -583,6 +583,23 @@ def test_help_names_the_options(words, capsys):
     assert ("--out" in shown) == (len(words) > 1)
 
 
+def test_help_of_label_names_the_formats(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["label", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    for name in (
+        "GeoTIFF",
+        ".npz",
+        ".xyz",
+        ".csv",
+        ".ply",
+        ".laz",
+        "--cell-size",
+        "metres between windows of a DEM (8)",
+    ):
+        assert name in shown
+
+
 def test_the_version_is_that_of_the_package(capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(["--version"])

@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -176,6 +176,51 @@ def test_numpy_numbers_become_plain_ones_in_json():
         "name": "inf",
         "laps": 3,
     }
+
+
+@dataclass(frozen=True)
+class Park:
+    ramp: tuple[Ramp, ...] = field(metadata={"items": Ramp})
+    name: str = "park"
+
+
+PARK = Park((Ramp(1, 0.5), Ramp(2, 0.25, (1.0, 2.0))), "north")
+
+
+def test_a_list_of_tables_becomes_a_tuple_of_configurations(ramp_file):
+    text = 'name = "north"\n[[ramp]]\nlength = 1\nslope = 0.5\n[[ramp]]\nlength = 2\nslope = 0.25\nmarks = [1.0, 2.0]'
+    park = load_toml(ramp_file(text), Park)
+    assert park == PARK and hash(park) == hash(PARK)
+
+
+@pytest.mark.parametrize("park", [PARK, replace(PARK, ramp=())])
+def test_a_list_of_tables_comes_back_from_json(park):
+    text = json.dumps(to_json(park), allow_nan=False)
+    assert from_json(json.loads(text), Park) == park
+    assert to_json(PARK)["ramp"][1] == {"length": 2, "slope": 0.25, "marks": [1.0, 2.0]}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[[ramp]]\nlength = 1\nslope = 0\n[[ramp]]\nslope = 0", "ramp 2: missing length"),
+        (
+            "[[ramp]]\nlength = -2\nslope = 0",
+            "ramp 1: length = -2: must be a length in metres, above 0 and at most 100",
+        ),
+        ("[[ramp]]\nlength = 1\nslop = 0", "ramp 1: unknown key 'slop'; allowed: length, slope, marks"),
+        ("[[ramp]]\nlength = 1\nslope_deg = 'a'", "ramp 1: slope_deg = 'a': must be a number of degrees"),
+        ("[ramp]\nlength = 1", "ramp = {'length': 1}: must be a list of tables [[ramp]]"),
+        ("ramp = 3", "ramp = 3: must be a list of tables [[ramp]]"),
+        ("ramp = [3]", "ramp = 3: must be a table [[ramp]]"),
+        ("name = 'a'", "missing ramp"),
+    ],
+)
+def test_the_table_of_a_list_that_is_wrong_is_numbered(ramp_file, text, message):
+    path = ramp_file(text)
+    with pytest.raises(InputError) as raised:
+        load_toml(path, Park)
+    assert str(raised.value) == f"{path}: {message}"
 
 
 @pytest.mark.parametrize(

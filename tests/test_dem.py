@@ -13,6 +13,7 @@ import rasterio
 from affine import Affine
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from points import CLOUDS, points_of
 
 import travjax
 from travjax.config import InputError
@@ -86,12 +87,39 @@ def nodes(windows, grid: Grid = Grid()) -> tuple[np.ndarray, np.ndarray]:
 # ---- Axes, origins, windows
 
 
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_rows_go_north_and_columns_east_in_every_format(tmp_path, suffix):
+def write_png(path: Path, heights: np.ndarray) -> Path:
+    """16 bits, in units of 1/64 m."""
+    from PIL import Image
+
+    Image.fromarray((64 * heights[::-1]).astype(np.uint16)).save(path)
+    return path
+
+
+EVERY_FORMAT: dict[str, tuple[str, Callable, dict]] = {
+    "GeoTIFF": ("site.tif", write_geotiff, {}),
+    "ASCII grid": ("site.asc", write_ascii, {}),
+    "npz": ("site.npz", write_npz, {}),
+    "npy": ("site.npy", write_npy, {"cell_size": CELL}),
+    "16-bit PNG": ("site.png", write_png, {"cell_size": CELL, "height_scale": 1 / 64}),
+} | {
+    form: (name, lambda path, heights, write=write: write(path, points_of(heights, CELL, WEST, SOUTH)), {})
+    for form, (name, write) in CLOUDS.items()
+}
+"""A file name, a writer and how the file is to be read."""
+
+
+@pytest.mark.parametrize("form", EVERY_FORMAT)
+def test_rows_go_north_and_columns_east_in_every_format(tmp_path, form):
+    name, write, options = EVERY_FORMAT[form]
     heights = uneven(NODES + 3, NODES + 7)
-    options = {"cell_size": CELL} if suffix == "npy" else {}
-    windows = load_dem(FORMATS[suffix](tmp_path / f"site.{suffix}", heights), **options)
-    np.testing.assert_array_equal(absolute(windows)[0], heights[:NODES, :NODES])
+    windows = load_dem(write(tmp_path / name, heights), stride=0.125, **options)
+    assert len(windows.heights) == 2 * 4
+    for one, (x, y) in zip(absolute(windows), windows.origins - windows.origins[0], strict=True):
+        row, col = round(y / CELL), round(x / CELL)
+        np.testing.assert_array_equal(one, heights[row : row + NODES, col : col + NODES])
+    placed = (0, 0) if "cell_size" in options else (WEST, SOUTH)
+    np.testing.assert_allclose(windows.origins[0], placed, rtol=0, atol=1e-9)
+    assert windows.origins[1].tolist() == pytest.approx([placed[0] + 0.125, placed[1]], abs=1e-9)
 
 
 def test_the_last_line_of_an_ascii_grid_is_the_southernmost_row(tmp_path):
@@ -546,11 +574,14 @@ def test_a_folder_is_no_elevation_map(tmp_path, name):
 
 
 @pytest.mark.parametrize("content", ["", "not a map\nat all\n", "II*\0"])
-@pytest.mark.parametrize("suffix", ["tif", "asc", "png", "xyz"])
+@pytest.mark.parametrize("suffix", ["tif", "asc", "png", "pcd", "e57"])
 def test_a_text_is_no_raster(tmp_path, suffix, content):
     path = tmp_path / f"site.{suffix}"
     path.write_text(content)
-    assert refusal(path).startswith("not a raster that can be read: ")
+    line = refusal(path)
+    assert line.startswith("not a raster that can be read: ")
+    if "not recognized" in line:
+        assert line.endswith("; beside GDAL's formats: .npy, .npz, .xyz, .txt, .csv, .pts, .ply, .las, .laz")
 
 
 @pytest.mark.parametrize("content", ["", "PK", "not a map\nat all\n"])

@@ -1,10 +1,12 @@
 """Files are written whole or not at all, and output folders are checked."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from travjax.config import InputError
-from travjax.files import output_folder, save_npz, written_whole
+from travjax.files import find_data, output_folder, save_npz, written_whole
 
 
 def listing(folder) -> set[str]:
@@ -136,3 +138,29 @@ def test_a_folder_that_takes_no_files_is_no_output_folder():
         InputError, match=r"^--out /proc/self: cannot be written: .*allowed: a folder you may write to$"
     ):
         output_folder("/proc/self")
+
+
+def test_data_are_found_here_or_under_travjax_data(tmp_path, monkeypatch):
+    (tmp_path / "here").mkdir()
+    (tmp_path / "data/terrain").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setenv("TRAVJAX_DATA", str(tmp_path / "data"))
+    far = tmp_path / "data/terrain/a.tif"
+    far.touch()
+    assert find_data("terrain/a.tif", "map") == far
+    assert find_data(str(far), "map") == far
+    (tmp_path / "here/terrain").mkdir()
+    with pytest.raises(InputError, match=f"^map terrain: no such file here, nor under TRAVJAX_DATA={tmp_path}/data; "):
+        find_data("terrain", "map")
+    (tmp_path / "here/terrain/a.tif").touch()
+    assert find_data("terrain/a.tif", "map") == Path("terrain/a.tif")
+
+
+@pytest.mark.parametrize("data", [None, ""])
+def test_missing_data_are_one_line_that_says_what_is_allowed(tmp_path, monkeypatch, data):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TRAVJAX_DATA", data) if data is not None else monkeypatch.delenv("TRAVJAX_DATA", raising=False)
+    with pytest.raises(InputError) as raised:
+        find_data("a.tif", "map of the moon", "--map FILE")
+    message = "map of the moon a.tif: no such file here, and TRAVJAX_DATA is not set; allowed: --map FILE"
+    assert str(raised.value) == message

@@ -1,7 +1,8 @@
 """What every configuration shares: one-line errors and checked TOML files.
 
 A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
-may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is.
+may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is. A field with the
+metadata `items` is a tuple of configurations of that kind, in the file a list of tables, `[[field]]`.
 """
 
 import dataclasses
@@ -75,7 +76,8 @@ def to_json(config: object) -> dict[str, Any]:
 def from_json(table: dict[str, Any], kind: type[Config]) -> Config:
     """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
     infinite = {"inf": math.inf, "-inf": -math.inf}
-    lists = {key: [infinite.get(item, item) for item in value] for key, value in table.items() if type(value) is list}
+    number = lambda item: infinite.get(item, item) if isinstance(item, str) else item
+    lists = {key: [number(item) for item in value] for key, value in table.items() if type(value) is list}
     return kind(**_fields_from(table | lists, kind))  # tables within a table hold no infinite numbers
 
 
@@ -93,7 +95,11 @@ def _fields_from(table: dict, kind: type) -> dict:
             require_number(key, value, -math.inf, math.inf, "a number of degrees")
             value = math.radians(value)
         if dataclasses.is_dataclass(names[name].default):
-            value = _inner(key, value, type(names[name].default))
+            value = _inner(key, value, type(names[name].default), f"[{key}]", f"[{key}]")
+        elif "items" in names[name].metadata:
+            inner, written = names[name].metadata["items"], f"[[{key}]]"
+            require(isinstance(value, list), key, value, f"a list of tables {written}")
+            value = [_inner(key, item, inner, written, f"{key} {number}:") for number, item in enumerate(value, 1)]
         values[name] = tuple(value) if isinstance(value, list) else value
     missing = [n for n, f in names.items() if n not in values and f.default is dataclasses.MISSING]
     if missing:
@@ -101,10 +107,10 @@ def _fields_from(table: dict, kind: type) -> dict:
     return values
 
 
-def _inner(key: str, table: object, kind: type) -> object:
-    """The configuration of a table within a table."""
-    require(isinstance(table, dict), key, table, f"a table [{key}]")
+def _inner(key: str, table: object, kind: type, written: str, place: str) -> object:
+    """The configuration of a table within a table; `place` names it in errors."""
+    require(isinstance(table, dict), key, table, f"a table {written}")
     try:
         return kind(**_fields_from(table, kind))  # type: ignore[arg-type]
     except InputError as error:
-        raise InputError(f"[{key}] {error}") from None
+        raise InputError(f"{place} {error}") from None

@@ -1,48 +1,33 @@
 """Real elevation maps: read a DEM, fill small holes, resample, cut into windows (SPEC section 11).
 
 Files are brought to one convention: row 0 is the southernmost, column 0 the westernmost, a value stands at its pixel's
-centre. GeoTIFF and whatever else rasterio reads run from north to south and are flipped; .npy and .npz are as grid.py.
+centre. GeoTIFF and whatever else rasterio reads run from north to south and are flipped; .npy and .npz are as grid.py;
+of points, x is east and y is north.
 """
 
 import warnings
 import zipfile
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from travjax.clouds import SUFFIXES, read_cloud
 from travjax.config import InputError, require, require_number
 from travjax.files import sha256
-from travjax.grid import HIGHEST, Grid
-
-FILL_DISTANCE = 0.125
-"""Metres: a hole is filled when each of its nodes is this near to known ground."""
-
-COARSEST = 0.125
-"""Metres: cells larger than this do not show a step or a rock."""
-
-LOWEST = -12_000.0
-"""Metres: what is deeper is no height; HIGHEST is in grid.py."""
-
-MARKERS = (-9999, -99999, -32768, 9999)
-"""Usual marks of unknown ground that some files do not declare."""
-
-
-@dataclass(frozen=True)
-class Raster:
-    """Heights of one file in this package's convention.
-
-    heights:   [rows, cols] float64 metres, NaN unknown
-    cell_size: metres between neighbouring values
-    origin:    x, y of heights[0, 0], the south-west value
-    crs:       coordinate system as the file names it, or None
-    """
-
-    heights: np.ndarray
-    cell_size: float
-    origin: tuple[float, float] = (0.0, 0.0)
-    crs: str | None = None
+from travjax.grid import Grid
+from travjax.raster import (
+    COARSEST,
+    Raster,
+    agreed_cell_size,
+    crs_name,
+    require_heights,
+    require_metric,
+    require_size,
+    resample,
+    without_small_holes,
+)
 
 
 @dataclass(frozen=True)
@@ -85,11 +70,13 @@ def load_dem(
 ) -> Windows:
     """Cuts a DEM into windows of the grid's size, starting at its south-west corner; partial windows are dropped.
 
-    path:         GeoTIFF or another raster that rasterio reads, .npy, or .npz with `heights` ([rows, cols], or several
-                  maps [n, rows, cols] that are cut one by one) and `cell_size`
+    path:         GeoTIFF or another raster that rasterio reads (an ASCII grid, a 16-bit PNG); .npy, or .npz with
+                  `heights` ([rows, cols], or several maps [n, rows, cols] that are cut one by one) and `cell_size`; a
+                  point cloud as clouds.py reads it: text (.xyz, .txt, .csv, .pts), .ply, .las, .laz
     stride:       metres between the origins of neighbouring windows, rounded to whole cells
-    cell_size:    metres, for files that do not say
-    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a 16-bit PNG needs it
+    cell_size:    metres, for files that do not say; of a point cloud the cells in which points are averaged, unless
+                  they stand on a lattice: the grid's spacing, or what holds two points on average if that is more
+    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a PNG needs it
     nodata:       a value that marks unknown ground, if the file does not declare it
     fill_holes:   interpolate holes whose every node lies within 0.125 m of known ground
     allow_coarse: take cells larger than 0.125 m
@@ -103,7 +90,8 @@ def load_dem(
         if value is not None:
             require_number(name, value, 0, 1000, "metres, above 0 and at most 1000")
     try:
-        rasters = [_checked(raster, grid, allow_coarse) for raster in _read(path, cell_size, height_scale, nodata)]
+        read = _read(path, cell_size, height_scale, nodata, grid)
+        rasters = [_checked(raster, grid, allow_coarse) for raster in read]
         offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round()) + 0.0
         parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
         checksum = sha256(path)
@@ -128,7 +116,7 @@ def load_dem(
 
 def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_holes: bool):
     """(heights, origins, share covered, share filled, share unknown) of one raster."""
-    raster, filled = _filled(raster) if fill_holes else (raster, 0.0)
+    raster, filled = without_small_holes(raster) if fill_holes else (raster, 0.0)
     raster = resample(raster, grid.spacing)
     heights = (raster.heights - offset).astype(np.float32)
     step = round(stride / grid.spacing)
@@ -141,13 +129,15 @@ def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_hole
     return cut, origins, covered, filled, np.isnan(heights).mean()
 
 
-def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
+def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None, grid: Grid) -> list[Raster]:
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
         raise InputError("no such file")
     if path.suffix.lower() in (".npy", ".npz"):
         return _read_numpy(path, cell_size, scale, nodata)
+    if path.suffix.lower() in SUFFIXES:
+        return [read_cloud(path, cell_size, scale, nodata, grid)]
     return [_read_raster(path, cell_size, scale, nodata)]
 
 
@@ -172,7 +162,8 @@ def _read_numpy(path: Path, cell_size: float | None, scale: float | None, nodata
     maps = _in_metres(heights.reshape(-1, *heights.shape[-2:]), scale or 1.0, 0.0, nodata)
     each = len(maps)
     if "cell_size" in entries:
-        cell_size = _agreed(_numbers(entries["cell_size"], "cell_size", "one number of metres", (1,))[0], cell_size)
+        stored = _numbers(entries["cell_size"], "cell_size", "one number of metres", (1,))[0]
+        cell_size = agreed_cell_size(stored, cell_size)
     elif cell_size is None:
         raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
     origins = _numbers(
@@ -204,14 +195,6 @@ def _in_metres(values: np.ndarray, scale: float, offset: float, nodata: float | 
     return heights
 
 
-def _agreed(of_file: float, given: float | None) -> float:
-    """The file's cell size, which the one given must not contradict."""
-    require_number("cell_size", of_file, 0, 1000, "metres, above 0 and at most 1000")
-    if given is not None:
-        require(abs(given - of_file) < 1e-4 * of_file, "cell_size", given, f"left out: the file says {of_file:g}")
-    return of_file
-
-
 def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> Raster:
     try:
         import rasterio
@@ -226,12 +209,13 @@ def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodat
                 scales, offsets, driver = file.scales, file.offsets, file.driver
     except rasterio.errors.RasterioError as error:
         reason = str(error.__cause__ or error).splitlines()[0]
-        raise InputError(f"not a raster that can be read: {reason}") from None
+        unknown = f"; beside GDAL's formats: .npy, .npz, {', '.join(SUFFIXES)}" if "not recognized" in reason else ""
+        raise InputError(f"not a raster that can be read: {reason}{unknown}") from None
     if not _is_real(values):
         raise InputError(f"heights: {values.dtype}: must be numbers")
     if driver in ("PNG", "JPEG", "GIF", "BMP", "WEBP") and scale is None:
         raise InputError(f"height_scale is missing: a {driver} holds no metres; give it (--height-scale METRES)")
-    _check_metric(crs)
+    require_metric(crs, scale is not None)
     if transform.is_identity:
         if cell_size is None:
             raise InputError("cell_size is missing: the file is not georeferenced; give it (--cell-size METRES)")
@@ -241,111 +225,17 @@ def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodat
     elif abs(transform.a + transform.e) > 1e-4 * transform.a:
         raise InputError(f"cell_size = {transform.a:g} x {-transform.e:g}: must be square")
     else:
-        cell_size = _agreed(transform.a, cell_size)
+        cell_size = agreed_cell_size(transform.a, cell_size)
         west, south = rasterio.transform.xy(transform, len(values) - 1, 0)
     heights = _in_metres(values.data, scales[0] if scale is None else scale, offsets[0], nodata)
     heights[np.ma.getmaskarray(values)] = np.nan
-    return Raster(heights[::-1], float(cell_size), (float(west), float(south)), crs.to_string() if crs else None)
-
-
-def _check_metric(crs) -> None:
-    """Refuses degrees and feet; no system, or a local one that names no unit, is taken as metres."""
-    if crs is None:
-        return
-    name = crs.to_string().partition("[")[2].partition(",")[0] or crs.to_string()
-    if crs.is_geographic:
-        raise InputError(f"crs = {name}: is in degrees; reproject it to metres (a UTM zone, say) first")
-    unit, metres = crs.units_factor
-    if unit.lower() != "unknown" and abs(metres - 1) > 1e-9:
-        raise InputError(f"crs = {name}: is in units of {metres:g} m ({unit}); reproject it to metres first")
+    return Raster(heights[::-1], float(cell_size), (float(west), float(south)), crs_name(crs))
 
 
 def _checked(raster: Raster, grid: Grid, allow_coarse: bool) -> Raster:
-    known = raster.heights[~np.isnan(raster.heights)]
-    if not known.size:
-        raise InputError("heights: all unknown (NaN or nodata): must hold some known ground")
-    for bad in (known.min(), known.max()):
-        hint = "if it marks unknown ground, say so (--nodata=VALUE)"
-        if not LOWEST <= bad <= HIGHEST:
-            raise InputError(f"heights = {bad:g}: must lie between {LOWEST:g} and {HIGHEST:g} m; {hint}")
-        if bad in MARKERS:
-            raise InputError(f"heights = {bad:g}: is a usual mark of unknown ground, not declared as such; {hint}")
+    require_heights(raster.heights[~np.isnan(raster.heights)])
     if raster.cell_size > COARSEST + 1e-9 and not allow_coarse:
         raise InputError(f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it)")
     north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
-    if min(north, east) < grid.size - 1e-6:
-        raise InputError(
-            f"size = {east:g} x {north:g} m: must be at least {grid.size:g} x {grid.size:g} m, node to node"
-        )
+    require_size(east, north, grid)
     return raster
-
-
-def _filled(raster: Raster) -> tuple[Raster, float]:
-    """Fills the small holes; also the share of nodes filled."""
-    unknown = np.isnan(raster.heights)
-    if not unknown.any():
-        return raster, 0.0
-    from scipy import ndimage  # takes 0.3 s to import
-
-    far = ndimage.distance_transform_edt(unknown, sampling=raster.cell_size) > FILL_DISTANCE + 1e-9
-    hole, holes = ndimage.label(unknown, np.ones((3, 3)))
-    deep = np.zeros(holes + 1, bool)
-    deep[hole[far]] = True
-    small = unknown & ~deep[hole]
-    if not small.any():
-        return raster, 0.0
-    return replace(raster, heights=_interpolated(raster.heights, small)), float(small.mean())
-
-
-def _interpolated(heights: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Heights where each node of a hole is the mean of its four neighbours: a plane stays one, no new extremes arise.
-
-    What lies outside the raster does not count. Nodes beside a hole are known or of the same hole.
-    """
-    from scipy.sparse import csc_matrix, diags
-    from scipy.sparse.linalg import spsolve
-
-    row, col = np.nonzero(holes)
-    number = np.full(holes.shape, -1)
-    number[holes] = np.arange(len(row))
-    level = heights[~np.isnan(heights)].mean()
-    neighbours, known = np.zeros(len(row)), np.zeros(len(row))
-    links = []
-    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        r, c = row + down, col + right
-        inside = (r >= 0) & (r < holes.shape[0]) & (c >= 0) & (c < holes.shape[1])
-        beside = np.flatnonzero(inside)
-        neighbours += inside
-        other = number[r[beside], c[beside]]
-        ground = other < 0
-        known[beside[ground]] += heights[r[beside[ground]], c[beside[ground]]] - level
-        links.append(np.stack([beside[~ground], other[~ground]]))
-    here, there = np.concatenate(links, axis=1)
-    coupling = csc_matrix((np.ones(len(here)), (here, there)), (len(row), len(row)))
-    filled = heights.copy()
-    filled[holes] = spsolve(diags(neighbours, format="csc") - coupling, known) + level
-    return filled
-
-
-def resample(raster: Raster, spacing: float) -> Raster:
-    """Bilinear values at another spacing, from the same south-west node; smoothed first where the source is finer.
-
-    A node is unknown where a value that it is made from is.
-    """
-    ratio = spacing / raster.cell_size
-    if abs(ratio - 1) < 1e-6:
-        return raster
-    from scipy import ndimage  # takes 0.3 s to import
-
-    unknown = np.isnan(raster.heights)
-    level = np.nanmedian(raster.heights)
-    heights, share = np.where(unknown, 0.0, raster.heights - level), (~unknown).astype(float)
-    if ratio > 1:
-        sigma = (ratio - 1) / 2
-        heights, share = (ndimage.gaussian_filter(field, sigma, mode="nearest") for field in (heights, share))
-        heights = np.divide(heights, share, out=heights, where=share > 0)
-    rows, cols = (np.arange(int((edge - 1) / ratio + 1e-6) + 1) * ratio for edge in raster.heights.shape)
-    at = np.meshgrid(rows, cols, indexing="ij")
-    values = ndimage.map_coordinates(heights, at, order=1, mode="nearest")
-    missing = ndimage.map_coordinates(unknown.astype(float), at, order=1, mode="nearest") > 1e-6
-    return replace(raster, heights=np.where(missing, np.nan, values + level), cell_size=spacing)

@@ -72,6 +72,19 @@ def output_folder(path: str | Path) -> Path:
     return folder
 
 
+def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX_DATA") -> Path:
+    """The file of that name, here or under TRAVJAX_DATA.
+
+    Raises InputError that says what it is, where it was looked for, and what is allowed.
+    """
+    data = os.environ.get("TRAVJAX_DATA")
+    for place in [Path(name)] + ([Path(data) / name] if data else []):
+        if place.is_file():
+            return place
+    where = f"nor under TRAVJAX_DATA={data}" if data else "and TRAVJAX_DATA is not set"
+    raise InputError(f"{what} {name}: no such file here, {where}; allowed: {allowed}")
+
+
 def sha256(path: Path) -> str:
     """The checksum of a file, in hexadecimal; it is read piece by piece."""
     with path.open("rb") as file:

@@ -7,6 +7,7 @@ from typing import Any
 
 from travjax import report, traverse
 from travjax.actions import ActionSpace
+from travjax.clouds import SUFFIXES
 from travjax.commands import options
 from travjax.config import require
 from travjax.dem import load_dem
@@ -23,25 +24,12 @@ def add(commands: options.Commands) -> None:
         "label",
         help="label every trajectory of synthetic or real maps",
         description="Labels every trajectory of maps with step, obstacle and tilt failures: of synthetic maps, or of "
-        "the windows of elevation maps (GeoTIFF and other rasters, .npy, .npz).",
+        "the windows of elevation maps: GeoTIFF and whatever else GDAL reads, .npy, .npz, and point clouds "
+        f"({', '.join(SUFFIXES)}).",
     )
     parser.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
     options.add_synthetic(parser, count=200, each="maps in all, the styles in turn")
-    parser.add_argument("--stride", type=float, metavar="M", help="metres between windows of a DEM (8)")
-    parser.add_argument(
-        "--cell-size", type=float, metavar="M", help="metres between a DEM's values, if the file does not say"
-    )
-    parser.add_argument("--height-scale", type=float, metavar="M", help="metres per unit of a DEM's values (1)")
-    parser.add_argument(
-        "--nodata",
-        type=float,
-        metavar="Z",
-        help="value that marks unknown ground, if the file does not say; as in --nodata=-9999",
-    )
-    parser.add_argument(
-        "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m of known ground"
-    )
-    parser.add_argument("--allow-coarse", action="store_true", help="take DEM cells larger than 0.125 m")
+    options.add_dem(parser, stride=8.0)
     options.add_robot(parser)
     options.add_grid(parser)
     parser.add_argument("--no-figures", action="store_true", help="write no figures")
@@ -75,8 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _maps(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of maps, batches of them, and how each DEM file was read."""
-    dem_options = ("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse")
-    unused = ("style", "count", "seed") if arguments.dem else dem_options
+    unused = ("style", "count", "seed") if arguments.dem else options.DEM_OPTIONS
     for name in unused:
         given = getattr(arguments, name)
         allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
@@ -90,14 +77,7 @@ def _maps(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batc
 
 def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of windows of all files, batches of them with where they come from, and how each file was read."""
-    settings: dict[str, Any] = {
-        "stride": 8.0 if arguments.stride is None else arguments.stride,
-        "cell_size": arguments.cell_size,
-        "height_scale": arguments.height_scale,
-        "nodata": arguments.nodata,
-        "fill_holes": not arguments.keep_holes,
-        "allow_coarse": arguments.allow_coarse,
-    }
+    settings = options.dem_settings(arguments)
     names = [path.name for path in arguments.dem]
     files, notes = [], []
     for path in arguments.dem:

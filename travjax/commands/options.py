@@ -38,12 +38,36 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
 
 
-def add_grid(parser: argparse.ArgumentParser) -> None:
+def add_grid(parser: argparse._ActionsContainer) -> None:
     """Size and spacing of maps; see `configuration`."""
     parser.add_argument("--size", type=float, default=8.0, metavar="M", help="edge of a map in metres (8)")
     parser.add_argument(
         "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
     )
+
+
+DEM_OPTIONS = ("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse")
+"""What `add_dem` adds; each is None or False where it is not given."""
+
+
+def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
+    """How elevation maps are read; see `dem_settings`."""
+    parser.add_argument("--stride", type=float, metavar="M", help=f"metres between windows of a DEM ({stride:g})")
+    parser.add_argument(
+        "--cell-size", type=float, metavar="M", help="metres between a DEM's values, or into which points are put"
+    )
+    parser.add_argument("--height-scale", type=float, metavar="M", help="metres per unit of a DEM's values (1)")
+    parser.add_argument(
+        "--nodata",
+        type=float,
+        metavar="Z",
+        help="value that marks unknown ground, if the file does not say; as in --nodata=-9999",
+    )
+    parser.add_argument(
+        "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m of known ground"
+    )
+    parser.add_argument("--allow-coarse", action="store_true", help="take DEM cells larger than 0.125 m")
+    parser.set_defaults(default_stride=stride)
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -63,6 +87,18 @@ def seed(arguments: argparse.Namespace) -> int:
     seed = arguments.seed or 0
     require(0 <= seed < 2**31, "--seed", seed, f"from 0 to {2**31 - 1}")
     return seed
+
+
+def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:
+    """How elevation maps are read, as `load_dem` takes it: by keyword, `stride` included."""
+    return {
+        "stride": arguments.default_stride if arguments.stride is None else arguments.stride,
+        "cell_size": arguments.cell_size,
+        "height_scale": arguments.height_scale,
+        "nodata": arguments.nodata,
+        "fill_holes": not arguments.keep_holes,
+        "allow_coarse": arguments.allow_coarse,
+    }
 
 
 def configuration(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
