@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 
-from travjax import cli, dataset, tfds_builder
+from travjax import cli, dataset, sites, tfds_builder
 from travjax.actions import ActionSpace
 from travjax.commands import dataset as command
 from travjax.dataset import ARRAYS, DatasetConfig, generate, load
 from travjax.grid import Grid
+from travjax.provenance import Site, SitesConfig
 from travjax.robot import Robot
 from travjax.sampling import balanced_subset
-from travjax.statistics import statistics_table
+from travjax.statistics import statistics_table, windows_table
 
 pytestmark = pytest.mark.usefixtures("compilation_cache")
 
@@ -36,8 +37,10 @@ def made(tmp_path_factory, few) -> Run:
 
 
 def assert_equal(one: dataset.Dataset, other: dataset.Dataset):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.arrays.keys() == other.arrays.keys()
+    for name, array in one.arrays.items():
+        np.testing.assert_array_equal(array, other.arrays[name])
+    assert (one.provenance and one.provenance.to_json()) == (other.provenance and other.provenance.to_json())
     parts = ("robot", "actions", "grid", "config")
     assert [getattr(one, name) for name in parts] == [getattr(other, name) for name in parts]
 
@@ -98,6 +101,156 @@ def test_the_heights_are_in_memory_once(tmp_path, few, monkeypatch):
         tracemalloc.stop()
     heights = 640 * 129 * 129 * 4
     assert heights < peak < heights + 25e6  # a piece of 16 MB that is written
+
+
+# ---- Real maps
+
+
+@pytest.fixture(scope="module")
+def dems(tmp_path_factory) -> dict[str, Path]:
+    """Two maps of 30 x 20 m, bumpy ground with a hole; a third of coarse is unknown, and its cells are large."""
+    folder = tmp_path_factory.mktemp("dem")
+    rng = np.random.default_rng(0)
+    for name in ("yard", "field"):
+        heights = np.cumsum(rng.normal(0, 0.02, (161, 241)), axis=1)
+        heights[40:70, 30:60] = np.nan
+        np.savez(folder / f"{name}.npz", heights=heights, cell_size=0.125, origin=(10.0, 20.0))
+    heights = np.zeros((65, 65), np.int16)
+    heights[:20] = -7
+    np.save(folder / "coarse.npy", heights)
+    return {path.stem: path for path in folder.iterdir()}
+
+
+SETTINGS = {"stride": 2.0, "max_unknown": 0.2, "gap": 9.0}
+REAL_WORDS = ("dataset", *SMALL, "--robot", "husky_a200", "--stride", 2, "--max-unknown", 0.2, "--gap", 9)
+
+
+@pytest.fixture(scope="module")
+def real(dems, tmp_path_factory, few) -> Run:
+    """A data set of two DEM files, one of them held out, and its export."""
+    folder = tmp_path_factory.mktemp("real") / "set"
+    strips = ("--test-strip", "east", 6, "--validation-strip", "west", 5)
+    files = ("--dem", dems["yard"], "--held-out", dems["field"])
+    return succeeds(folder, *REAL_WORDS, *files, *strips, "--actions", few, "--tfds", folder.with_name("tfds"))
+
+
+def config_of(dems) -> SitesConfig:
+    yard = Site(str(dems["yard"]), test_strip=("east", 6.0), validation_strip=("west", 5.0))
+    return SitesConfig((yard, Site(str(dems["field"]), split="test")), **SETTINGS)
+
+
+def test_dem_files_become_the_data_set_of_their_sites(real, dems):
+    loaded = load(real.folder)
+    assert_equal(loaded, sites.read(config_of(dems), Robot.load("husky_a200"), FEW, GRID))
+    assert loaded.provenance.config == config_of(dems)
+    assert set(loaded.group.tolist()) == {"yard", "field"} and all(len(loaded.maps_of(s)) for s in dataset.SPLITS)
+
+
+def test_a_file_of_sites_gives_the_same(real, dems, tmp_path, few):
+    (tmp_path / "sites.toml").write_text(f"""
+        stride = 2.0
+        max_unknown = 0.2
+        gap = 9.0
+        [[site]]
+        file = "{dems["yard"]}"
+        test_strip = ["east", 6.0]
+        validation_strip = ["west", 5.0]
+        [[site]]
+        file = "{dems["field"]}"
+        split = "test"
+    """)
+    words = ("--sites", tmp_path / "sites.toml", *SMALL, "--robot", "husky_a200", "--actions", few)
+    assert_equal(load(succeeds(tmp_path / "set", "dataset", *words).folder), load(real.folder))
+
+
+def test_what_became_of_the_windows_is_printed_and_written(real):
+    loaded = load(real.folder)
+    tables = [statistics_table(loaded, as_in_paper=False), windows_table(loaded.provenance)]
+    assert all(f"\n{table}\n" in real.out for table in tables)
+    assert real.folder.with_name("set_statistics.txt").read_text() == "\n\n".join(tables) + "\n"
+    copies = 3 * loaded.provenance.sites[0].train
+    assert f"Windows of the sites, beside which {copies} maps are turned copies:" in real.out
+    checked = run_words("dataset", "--check", real.folder)[1]
+    assert all(table in checked for table in tables)
+
+
+def test_an_export_of_real_maps_is_read_back_equal(real):
+    assert_equal(tfds_builder.read(real.folder.with_name("tfds")), load(real.folder))
+
+
+def test_progress_of_real_maps_is_shown(real):
+    bars = dict(line.split(": ", 1) for line in real.err.replace("\r", "\n").splitlines() if line)
+    assert list(bars) == ["making", "saving", "exporting"]
+    windows = sum(site.windows - site.too_unknown for site in load(real.folder).provenance.sites)
+    labelled = int(re.match(r"(\d+)map \[", bars["making"])[1])
+    assert labelled >= windows and (load(real.folder).provenance.quarter_turns > 0).sum() < labelled
+
+
+def test_reading_options_reach_the_files(dems, tmp_path, few):
+    reading = ("--cell-size", 0.25, "--height-scale", 0.001, "--nodata=-7", "--allow-coarse", "--keep-holes")
+    more = ("--no-rotations", "--max-unknown", 1, "--actions", few, "--robot", "husky_a200")
+    done = succeeds(tmp_path / "set", "dataset", *SMALL, "--dem", dems["coarse"], *reading, *more)
+    wanted = Site(str(dems["coarse"]), cell_size=0.25, height_scale=0.001, nodata=-7.0)
+    expected = SitesConfig((wanted,), max_unknown=1.0, rotations=False, fill_holes=False, allow_coarse=True)
+    assert load(done.folder).provenance.config == expected
+
+
+def test_a_data_set_may_be_for_the_test_alone(dems, tmp_path, few):
+    done = succeeds(tmp_path / "set", *REAL_WORDS, "--held-out", dems["field"], "--actions", few)
+    assert set(load(done.folder).split.tolist()) == {2}
+    assert re.search(r"^train +0 +0 +- +- +- +- +- +-$", done.out, re.MULTILINE)
+
+
+BAD_REAL = {
+    "sites that are missing": (["--sites", "none.toml"], "none.toml: cannot be read: No such file"),
+    "a file that is missing": (["--dem", "none.tif"], "site none: file none.tif: no such file here, "),
+    "both": (["--sites", "s.toml", "--dem", "a.tif"], r"--dem = \['a.tif'\]: must be left out where --sites is given"),
+    "sites and a stride": (["--sites", "s.toml", "--stride", "2"], "--stride = 2.0: must be left out where --sites is"),
+    "sites and a seed": (["--sites", "s.toml", "--seed", "2"], "--seed = 2: must be left out where --sites is given"),
+    "maps of files": (["--dem", "a.tif", "--maps", "9"], "--maps = 9: must be left out where DEM files are given"),
+    "share of files": (["--held-out", "a.tif", "--test", "0.5"], "--test = 0.5: must be left out where DEM files"),
+    "gap of nothing": (["--gap", "9"], "--gap = 9.0: must be left out where no DEM file is given"),
+    "rotations of nothing": (["--no-rotations"], "--no-rotations = True: must be left out where no DEM file is given"),
+    "reading of nothing": (["--allow-coarse"], "--allow-coarse = True: must be left out where no DEM file is given"),
+    "strip of nothing": (
+        ["--test-strip", "east", "9"],
+        r"--test-strip = \['east', '9'\]: must be left out where no DEM",
+    ),
+    "strip of held-out files": (
+        ["--held-out", "a.tif", "--test-strip", "east", "9"],
+        r"--test-strip = \['east', '9'\]: must be left out where no --dem file is given",
+    ),
+    "strip without a number": (
+        ["--dem", "a.tif", "--test-strip", "east", "wide"],
+        "--test-strip = east wide: must be a side, then metres",
+    ),
+    "unknown side": (
+        ["--dem", "a.tif", "--validation-strip", "up", "9"],
+        r"validation_strip = \('up', 9.0\): must be of one of north, east, south, west, then metres",
+    ),
+    "small gap": (["--dem", "a.tif", "--gap", "1"], "gap = 1.0: must be a distance in metres, at least 8"),
+    "no share": (["--dem", "a.tif", "--max-unknown", "2"], "max_unknown = 2.0: must be a share from 0 to 1"),
+    "names alike": (["--dem", "a.tif", "--held-out", "b/a.tif"], r"names of sites = \['a'\]: must be different"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_REAL)
+def test_bad_real_maps_are_one_line_and_nothing_is_written(tmp_path, monkeypatch, name):
+    words, expected = BAD_REAL[name]
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    done = run(tmp_path / "out", "dataset", *words)
+    assert (done.code, done.out) == (2, "")
+    assert re.match(f"travjax: {expected}", done.err.splitlines()[-1]), done.err
+    assert files(tmp_path) == {tmp_path / "here"}
+
+
+def test_a_strip_without_windows_names_file_and_strip(dems, tmp_path, few):
+    words = ("--dem", dems["yard"], "--test-strip", "north", 3, "--actions", few)
+    done = run(tmp_path / "set", *REAL_WORDS, *words)
+    message = "travjax: site yard: test_strip = north 3 m: must leave at least one of "
+    assert done.code == 2 and done.err.splitlines()[-1].startswith(message)
+    assert not files(tmp_path)
 
 
 # ---- An existing data set
@@ -162,7 +315,18 @@ def test_a_damaged_data_set_is_one_line(copied, name):
 
 @pytest.mark.parametrize(
     "words",
-    [("--maps", 3), ("--seed", 4), ("--test", 0.5), ("--robot", "leo_rover"), ("--size", 4), ("--actions", "few.toml")],
+    [
+        ("--maps", 3),
+        ("--seed", 4),
+        ("--test", 0.5),
+        ("--robot", "leo_rover"),
+        ("--size", 4),
+        ("--actions", "few.toml"),
+        ("--sites", "sites.toml"),
+        ("--dem", "a.tif"),
+        ("--gap", 9),
+        ("--stride", 2),
+    ],
     ids=lambda words: words[0],
 )
 def test_a_check_takes_no_options_of_what_is_made(copied, words):
@@ -283,4 +447,4 @@ def test_help_names_the_options(capsys):
         cli.main(["dataset", "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    assert all(f"--{name} " in shown for name in (*command.MAKING, "check", "tfds"))
+    assert all(f"--{name.replace('_', '-')} " in shown for name in (*command.MAKING, "check", "tfds"))

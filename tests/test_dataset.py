@@ -1,6 +1,7 @@
 """Data sets: made from one seed, split by map, and kept on disk so that nothing wrong is read back."""
 
 import errno
+import hashlib
 import json
 import os
 import tracemalloc
@@ -18,6 +19,7 @@ from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, lo
 from travjax.dataset import save as save_dataset
 from travjax.files import folder_written_whole
 from travjax.grid import Grid
+from travjax.provenance import PROVENANCE_ARRAYS, Provenance, Site, SiteRecord, SitesConfig
 from travjax.robot import Robot
 from travjax.terrain import STYLES, generate_terrain
 from travjax.traverse import label, simulate, unpacked
@@ -42,10 +44,26 @@ def real_maps(count: int = 6) -> Dataset:
     return Dataset(heights, labels, group, np.zeros(count, np.uint32), split, ROBOT, ACTIONS, GRID, None)
 
 
+def placed_maps() -> Dataset:
+    """The same six with their places."""
+    config = SitesConfig((Site("data/site 0.tif", test_strip=("north", 9.5)), Site("b.npy", "site 1", nodata=-1.5)))
+    crs = 'LOCAL_CS["unnamed"]'
+    records = (
+        SiteRecord(
+            "site 0", "/there/data/site 0.tif", "ab" * 32, crs, 0.1, 2000.5, 0.9, 0.01, 0.2, 9, 3, 1, 1, 2, 1, 1
+        ),
+        SiteRecord("site 1", "b.npy", "cd" * 32, None, 0.0625, 0.0, 1.0, 0.0, 0.0, 4, 1, 2, 1, 0, 0, 0),
+    )
+    origin = np.arange(12).reshape(6, 2) + 0.1 + 5e6
+    return replace(real_maps(), provenance=Provenance(origin, np.array([0, 1, 2, 3, 0, 0], np.uint8), config, records))
+
+
 def assert_equal(one: Dataset, other: Dataset):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        assert getattr(one, name).dtype == getattr(other, name).dtype
+    assert one.arrays.keys() == other.arrays.keys()
+    for name, array in one.arrays.items():
+        np.testing.assert_array_equal(array, other.arrays[name])
+        assert array.dtype == other.arrays[name].dtype
+    assert (one.provenance and one.provenance.to_json()) == (other.provenance and other.provenance.to_json())
     parts = ("robot", "actions", "grid", "config")
     assert [getattr(one, name) for name in parts] == [getattr(other, name) for name in parts]
 
@@ -243,6 +261,62 @@ def test_arrays_that_do_not_fit_together_are_named(made, arrays, message):
         replace(made, **arrays)
 
 
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"origin": np.zeros((6, 3))}, r"origin = '\[6, 3\] of float64': must be \[6, 2\] of float64"),
+        ({"origin": np.zeros((6, 2), np.float32)}, r"origin = '\[6, 2\] of float32': must be \[6, 2\] of float64"),
+        ({"quarter_turns": np.zeros(5, np.uint8)}, r"quarter_turns = '\[5\] of uint8': must be \[6\] of uint8"),
+        ({"quarter_turns": np.zeros(6, np.int64)}, r"quarter_turns = '\[6\] of int64': must be \[6\] of uint8"),
+    ],
+)
+def test_places_that_do_not_fit_are_named(arrays, message):
+    maps = placed_maps()
+    with pytest.raises(InputError, match=f"^{message}"):
+        replace(maps, provenance=replace(maps.provenance, **arrays))
+
+
+def test_maps_of_a_site_without_a_record_are_named():
+    group = np.array([*["site 0"] * 5, "moon"])
+    with pytest.raises(InputError, match=r"^group = \['moon'\]: must be of site 0, site 1$"):
+        replace(placed_maps(), group=group)
+
+
+def test_synthetic_maps_have_no_places(made):
+    with pytest.raises(InputError, match="^provenance = 'given': must be left out where there is a config"):
+        replace(made, provenance=placed_maps().provenance)
+    assert list(made.arrays) == list(ARRAYS)
+    assert list(placed_maps().arrays) == [*ARRAYS, *PROVENANCE_ARRAYS]
+
+
+# Fingerprints
+
+
+def test_the_fingerprint_of_synthetic_maps_is_that_of_labels_seeds_groups_and_splits(made):
+    # Runs have written it down: what changes this makes them refuse their own data set.
+    data = ["\n".join(made.group).encode(), *(getattr(made, name).tobytes() for name in ("labels", "seed", "split"))]
+    assert made.fingerprint == hashlib.sha256(b"".join(data)).hexdigest()[:16]
+    assert replace(made, heights=made.heights + 1).fingerprint == made.fingerprint
+
+
+def moved(array: np.ndarray) -> np.ndarray:
+    changed = array.copy()
+    changed.flat[-1] = 2 if array.dtype == np.uint8 else 0.5
+    return changed
+
+
+@pytest.mark.parametrize("name", ["labels", "split", "heights", "origin", "quarter_turns", "group"])
+def test_real_maps_that_differ_in_anything_have_another_fingerprint(name):
+    maps = placed_maps()
+    if name in PROVENANCE_ARRAYS:
+        other = replace(maps, provenance=replace(maps.provenance, **{name: moved(maps.arrays[name])}))
+    elif name == "group":
+        other = replace(maps, group=maps.group[::-1].copy())
+    else:
+        other = replace(maps, **{name: np.roll(maps.split, 1) if name == "split" else moved(maps.arrays[name])})
+    assert other.fingerprint != maps.fingerprint == placed_maps().fingerprint
+
+
 # On disk
 
 
@@ -260,6 +334,19 @@ def test_real_maps_have_sites_and_unknown_ground(tmp_path):
     loaded = load(str(tmp_path / "set"))
     assert_equal(loaded, real_maps())
     assert loaded.config is None and np.isnan(loaded.heights).any()
+
+
+def test_places_are_kept_beside_the_maps(tmp_path):
+    save_dataset(placed_maps(), tmp_path / "set")
+    assert_equal(load(tmp_path / "set"), placed_maps())
+    names = {"dataset.json", *(f"{name}.npy" for name in ARRAYS + PROVENANCE_ARRAYS)}
+    assert listing(tmp_path / "set") == names
+    table = json.loads((tmp_path / "set/dataset.json").read_text())["provenance"]
+    assert table["config"]["site"][0]["test_strip"] == ["north", 9.5]
+    assert table["sites"][0]["file"] == "/there/data/site 0.tif" and table["sites"][1]["crs"] is None
+    save_dataset(real_maps(), tmp_path / "set")
+    assert_equal(load(tmp_path / "set"), real_maps())
+    assert listing(tmp_path / "set") == {"dataset.json", *(f"{name}.npy" for name in ARRAYS)}
 
 
 def test_straight_arcs_are_written_as_text(made, tmp_path):
@@ -457,6 +544,18 @@ DAMAGES = {
         lambda folder: changed_table(folder, config={"maps": 6}),
         "{0}: group = ['site 0']: must be of mountain_crater, ",
     ),
+    "no places": (
+        lambda folder: (folder / "origin.npy").unlink(),
+        "{0}/origin.npy: cannot be read: No such file or directory",
+    ),
+    "turns out of range": (
+        lambda folder: changed_array(folder, "quarter_turns", np.full(6, 4, np.uint8)),
+        "{0}: quarter_turns = [4]: must be from 0 to 3",
+    ),
+    "places without a site": (
+        lambda folder: changed_table(folder, provenance=placed_maps().provenance.to_json() | {"sites": []}),
+        "{0}: records of sites = []: must be of site 0, site 1",
+    ),
     "objects": (
         lambda folder: changed_array(folder, "group", np.array([{}] * 6, object)),
         "{0}: Object arrays cannot be loaded",
@@ -467,7 +566,8 @@ DAMAGES = {
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_what_is_wrong_is_said_in_one_line(tmp_path, damage):
     do, message = DAMAGES[damage]
-    save_dataset(real_maps(), tmp_path / "set")
+    placed = "places" in damage or "turns" in damage
+    save_dataset(placed_maps() if placed else real_maps(), tmp_path / "set")
     do(tmp_path / "set")
     with pytest.raises(InputError) as raised:
         load(tmp_path / "set")

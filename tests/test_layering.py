@@ -20,10 +20,14 @@ ORDER = [
     "traverse",
     "reference",
     "inputs",
+    "raster",
+    "clouds",
     "dem",
     "labelling",
     "sampling",
+    "provenance",
     "dataset",
+    "sites",
     "tfds_builder",
     "convolution",
     "resnet",
@@ -42,9 +46,11 @@ ORDER = [
     "train",
     "baselines",
     "evaluate",
+    "transfer",
     "plots",
-    "curves",
     "report",
+    "transfer_scores",
+    "curves",
     "statistics",
     "bench",
     "bench_network",
@@ -56,12 +62,17 @@ ORDER = [
     "commands.train",
     "commands.evaluate",
     "commands.bench",
+    "entry",
     "cli",
+    "experiments.launch",
+    "experiments.transfer",
+    "experiments.synthetic",
+    "experiments.timing",
 ]
 """From the bottom to the top; __init__ and __main__ may import any of them."""
 
-FREE = ["__init__", "__main__", "commands.__init__"]
-PACKAGES = ["travjax", "travjax.commands"]
+FREE = ["__init__", "__main__", "commands.__init__", "experiments.__init__"]
+PACKAGES = ["travjax", "travjax.commands", "travjax.experiments"]
 PACKAGE = Path(travjax.__file__).parent
 MODULES = sorted(".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py"))
 

@@ -1,13 +1,17 @@
 """Failure shares of a data set against those counted trajectory by trajectory."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import SETTINGS
 
 from travjax import report, statistics
-from travjax.dataset import SPLITS, Dataset
+from travjax.dataset import SPLITS, Dataset, DatasetConfig
+from travjax.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.sampling import balanced_subset
-from travjax.statistics import balanced_subsets, label_counts, statistics_rows, statistics_table
+from travjax.statistics import balanced_subsets, label_counts, statistics_rows, statistics_table, windows_table
+from travjax.terrain import STYLES
 from travjax.traverse import unpacked
 
 ROBOT, ACTIONS, GRID = SETTINGS["coarse small map"]
@@ -60,12 +64,14 @@ def test_the_shares_are_those_of_a_loop(dataset):
     chosen = {"all maps": slice(None)}
     chosen |= {name: dataset.group == name for name in "abc"}
     chosen |= {name: dataset.split == index for index, name in enumerate(SPLITS)}
+    sites = [f"{site}, {split}" for site in "abc" for split in SPLITS]
+    chosen |= {name: chosen[name[0]] & chosen[name[3:]] for name in sites}
     for name, maps in chosen.items():
         assert rows[name] == {"what": name} | slow_row(dataset.labels[maps])
     assert list(rows) == [
-        "b",
-        "a",
-        "c",
+        *("b", *sites[3:6]),
+        *("a", *sites[:3]),
+        *("c", *sites[6:]),
         "all maps",
         *SPLITS,
         "paper's test set",
@@ -132,3 +138,25 @@ def test_the_balanced_subsets_are_those_of_training_and_validation(dataset):
     subsets = balanced_subsets(dataset)
     for name in ("train", "validation"):
         assert set(subsets[f"{name}, balanced"][0].tolist()) <= set(dataset.maps_of(name).tolist())
+
+
+def test_a_site_of_one_split_and_a_style_have_one_row(dataset):
+    alone = replace(dataset, split=np.repeat(np.arange(3, dtype=np.uint8), 30))
+    assert list(rows_of(alone))[:4] == ["b", "a", "c", "all maps"]
+    config = DatasetConfig(90)
+    made = replace(dataset, group=config.styles(), seed=config.seeds(), split=config.splits(), config=config)
+    assert list(rows_of(made))[:6] == [*STYLES, "all maps"]
+
+
+def test_what_became_of_the_windows_has_a_line_for_each_site_and_all(dataset):
+    sites = SitesConfig((Site("a.tif"), Site("b.tif", split="test")))
+    read = ("ab" * 32, None, 0.0625, 2000.5, 0.9, 0.00123, 0.256)
+    one = SiteRecord("a", "/there/a.tif", *read, 1030, 1000, 10, 0, 5, 7, 8)
+    other = SiteRecord("b", "/there/b.tif", *read, 9, 0, 0, 6, 3, 0, 0)
+    places = Provenance(np.zeros((90, 2)), np.zeros(90, np.uint8), sites, (one, other))
+    lines = [line.split() for line in windows_table(places).splitlines()]
+    assert lines[-3] == ["a", "0.0625", "0.123%", "25.6%", "1,030", "1,000", "10", "0", "5", "7", "8"]
+    assert lines[-2] == ["b", "0.0625", "0.123%", "25.6%", "9", "0", "0", "6", "3", "0", "0"]
+    assert lines[-1] == ["all", "sites", "1,039", "1,000", "10", "6", "8", "7", "8"]
+    alone = Provenance(np.zeros((90, 2)), np.zeros(90, np.uint8), SitesConfig((Site("a.tif"),)), (one,))
+    assert windows_table(alone).splitlines()[-1].split() == lines[-3]

@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ import pytest
 from conftest import SETTINGS
 
 from travjax.config import InputError
-from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig
+from travjax.dataset import SPLITS, Dataset, DatasetConfig
+from travjax.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.terrain import STYLES
 from travjax.tfds_builder import NAME, VERSION, export, read
 
@@ -42,9 +44,11 @@ def exported(data, tmp_path) -> Path:
 
 
 def assert_equal(one: Dataset, other: Dataset):
-    for name in ARRAYS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-        assert getattr(one, name).dtype == getattr(other, name).dtype
+    assert one.arrays.keys() == other.arrays.keys()
+    for name, array in one.arrays.items():
+        np.testing.assert_array_equal(array, other.arrays[name])
+        assert array.dtype == other.arrays[name].dtype
+    assert (one.provenance and one.provenance.to_json()) == (other.provenance and other.provenance.to_json())
     parts = ("robot", "actions", "grid", "config")
     assert [getattr(one, name) for name in parts] == [getattr(other, name) for name in parts]
 
@@ -71,6 +75,16 @@ def real(data) -> Dataset:
 def test_real_maps_keep_their_site(real, tmp_path):
     export(real, tmp_path / "tfds")
     assert_equal(read(tmp_path / "tfds"), real)
+
+
+def test_real_maps_keep_their_places(real, tmp_path):
+    config = SitesConfig((Site("Möckeln.tif", validation_strip=("east", 24.0)),))
+    of_file = ("ab" * 32, None, 0.0625, 20.5, 0.9, 0.001, 0.2)
+    record = SiteRecord("Möckeln", "/there/Möckeln.tif", *of_file, 40, 30, 6, 0, 2, 1, 1)
+    origin, turns = np.random.default_rng(1).uniform(4e6, 5e6, (40, 2)), np.arange(40, dtype=np.uint8) % 4
+    placed = replace(real, provenance=Provenance(origin, turns, config, (record,)))
+    export(placed, tmp_path / "tfds")
+    assert_equal(read(tmp_path / "tfds"), placed)
 
 
 def test_tensorflow_datasets_finds_it_by_name(data, exported):

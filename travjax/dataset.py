@@ -1,7 +1,7 @@
 """The data set: maps, the labels of all their trajectories, and which split each map belongs to (SPEC section 7).
 
-`generate` makes it from one seed, all in memory; `save` and `load` keep it as one folder of .npy files with a
-`dataset.json` that holds the configurations and each file's size and SHA-256.
+`generate` makes it from one seed, all in memory, and sites.py makes one of real maps; `save` and `load` keep it as one
+folder of .npy files with a `dataset.json` that holds the configurations and each file's size and SHA-256.
 """
 
 import dataclasses
@@ -24,17 +24,16 @@ from travjax.config import InputError, from_json, require, require_number, to_js
 from travjax.files import folder_written_whole, sha256
 from travjax.footprint import node_table
 from travjax.grid import Grid
+from travjax.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
 from travjax.robot import Robot
 from travjax.sampling import random_keys
 from travjax.terrain import STYLES, generate_terrain
 from travjax.traverse import failures, packed, simulate
 
-SPLITS = ("train", "validation", "test")
-
 FORMAT, FORMAT_VERSION = "travjax data set", 1
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
-"""Each is a file of its own, `heights.npy` and so on."""
+"""Each is a file of its own, `heights.npy` and so on; real maps have PROVENANCE_ARRAYS as well."""
 
 CHUNK = 256
 """Maps made and labelled before they are copied into the arrays."""
@@ -120,6 +119,7 @@ class Dataset:
     split:   [n] uint8 index into SPLITS
     robot, actions, grid: what the labels hold for
     config:  what the maps were made from; None for real maps
+    provenance: where real maps come from; None if that is not known
 
     Raises InputError when the arrays do not fit together.
     """
@@ -133,8 +133,10 @@ class Dataset:
     actions: ActionSpace
     grid: Grid
     config: DatasetConfig | None
+    provenance: Provenance | None = None
 
     def __post_init__(self):
+        require(not (self.config and self.provenance), "provenance", "given", "left out where there is a config")
         maps = self.config.maps if self.config else len(self.split)
         expected = {
             "heights": ((maps, *self.grid.shape), "f4"),
@@ -142,22 +144,31 @@ class Dataset:
             "group": ((maps,), "U"),
             "seed": ((maps,), "u4"),
             "split": ((maps,), "u1"),
+            "origin": ((maps, 2), "f8"),
+            "quarter_turns": ((maps,), "u1"),
         }
-        for name, (shape, kind) in expected.items():
-            array = getattr(self, name)
+        for name, array in self.arrays.items():
+            shape, kind = expected[name]
             fits = array.shape == shape and kind in (array.dtype.kind, array.dtype.str[1:])
             allowed = f"{list(shape)} of {'text' if kind == 'U' else np.dtype(kind)}"
             require(fits, name, f"{list(array.shape)} of {array.dtype}", allowed)
         wrong = self.split[self.split >= len(SPLITS)]
         require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
-        unknown = self.group[~np.isin(self.group, STYLES)] if self.config else self.group[:0]
-        require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(STYLES)}")
+        groups = STYLES if self.config else self.provenance and [site.name for site in self.provenance.sites]
+        unknown = self.group[~np.isin(self.group, groups)] if groups else self.group[:0]
+        require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by name, those of the provenance last."""
+        return {name: getattr(self, name) for name in ARRAYS} | (self.provenance.arrays if self.provenance else {})
 
     @cached_property
     def fingerprint(self) -> str:
-        """Tells data sets apart: a hash of labels, seeds, groups and splits."""
+        """Tells data sets apart: a hash of labels, seeds, groups and splits, and of heights and places of real maps."""
         digest = hashlib.sha256("\n".join(self.group).encode())
-        for array in (self.labels, self.seed, self.split):
+        places = [] if self.config else [self.heights, *(self.provenance.arrays.values() if self.provenance else ())]
+        for array in (self.labels, self.seed, self.split, *places):
             digest.update(np.ascontiguousarray(array).data)
         return digest.hexdigest()[:16]
 
@@ -203,15 +214,20 @@ def require_same(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Gri
 
 
 def configs_to_json(dataset: Dataset) -> dict[str, Any]:
-    """Robot, actions, grid and config of a data set as JSON can hold them, with the version of travjax."""
+    """All of a data set but its arrays as JSON can hold it, with the version of travjax."""
     parts = {name: getattr(dataset, name) for name in ("robot", "actions", "grid", "config")}
-    return {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
+    table = {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
+    return table | ({"provenance": dataset.provenance.to_json()} if dataset.provenance else {})
 
 
-def configs_from_json(table: dict[str, Any]) -> dict[str, Any]:
-    """The arguments robot, actions, grid and config of the Dataset that `configs_to_json` was given."""
+def put_together(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
+    """The data set of what `configs_to_json` gave and its arrays."""
     kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid, "config": DatasetConfig}
-    return {name: table[name] and from_json(table[name], kind) for name, kind in kinds.items()}
+    configs = {name: table[name] and from_json(table[name], kind) for name, kind in kinds.items()}
+    places = {name: array for name, array in arrays.items() if name in PROVENANCE_ARRAYS}
+    provenance = Provenance.from_json(table["provenance"], **places) if "provenance" in table else None
+    parts: dict[str, Any] = configs | {name: arrays[name] for name in ARRAYS}
+    return Dataset(**parts, provenance=provenance)
 
 
 def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = None) -> None:
@@ -221,7 +237,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
     or when it cannot be written: a full disk, no permission.
     """
     with folder_written_whole(Path(folder), is_dataset) as temporary:
-        arrays = {f"{name}.npy": getattr(dataset, name) for name in ARRAYS}
+        arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
         (temporary / "dataset.json").write_text(json.dumps(table | {"sha256": _digest(table)}, indent=1) + "\n")
@@ -239,8 +255,8 @@ def load(folder: str | Path) -> Dataset:
     for name, file in table["files"].items():
         _verify(folder / name, file["bytes"], file["sha256"])
     try:
-        arrays = {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in ARRAYS}
-        return Dataset(**arrays, **configs_from_json(table))
+        names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
+        return put_together(table, {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in names})
     except (InputError, OSError, ValueError) as error:
         raise InputError(f"{folder}: {error}") from None
 
@@ -304,7 +320,7 @@ def is_dataset(folder: Path) -> bool:
     """Whether the folder holds a data set of any version and nothing else."""
     try:
         table = json.loads((folder / "dataset.json").read_text())
-        ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS)}
+        ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS + PROVENANCE_ARRAYS)}
         return table["format"] == FORMAT and {path.name for path in folder.iterdir()} <= ours
     except (OSError, ValueError, TypeError, KeyError):
         return False

@@ -1,4 +1,4 @@
-"""What a data set holds: failure shares of each style and split, and of its balanced subsets, beside the paper's.
+"""What a data set holds: failure shares of each group and split, and of its balanced subsets, beside the paper's.
 
 Counted from the packed labels a few maps at a time, since a data set of the paper's size has 173 million of them.
 """
@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from travjax.config import to_json
 from travjax.dataset import SPLITS, Dataset
+from travjax.provenance import Provenance
 from travjax.report import PAPER_SHARES, rows_table
 from travjax.sampling import CHUNK, FAILED, UNKNOWN, Samples, balanced_subset
 from travjax.traverse import EVENTS
@@ -19,6 +21,18 @@ COLUMNS = {
     **{name: name for name in PAPER_SHARES},
     "none": "maps with none",
     "known": "known",
+}
+
+WINDOW_COLUMNS = {
+    "name": "site",
+    "cell_size": "cells\n(m)",
+    "filled": "filled",
+    "unknown": "unknown",
+    "windows": "windows",
+    **{split: split for split in SPLITS},
+    "too_unknown": "left out:\nunknown",
+    "near_test": "left out:\nnear test",
+    "shared": "left out:\nshared",
 }
 
 CODES = 2 * UNKNOWN
@@ -36,10 +50,14 @@ def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None
 def statistics_rows(
     dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True
 ) -> Iterator[dict]:
-    """The rows of `statistics_table`."""
+    """The rows of `statistics_table`; a site of several splits has one for each of them as well."""
     counts = label_counts(dataset.labels)
     for name in dict.fromkeys(dataset.group.tolist()):
-        yield _row(name, counts[dataset.group == name])
+        members = dataset.group == name
+        yield _row(name, counts[members])
+        splits = np.unique(dataset.split[members]) if dataset.config is None else ()
+        for index in splits if len(splits) > 1 else ():
+            yield _row(f"{name}, {SPLITS[index]}", counts[members & (dataset.split == index)])
     yield _row("all maps", counts)
     for index, name in enumerate(SPLITS):
         yield _row(name, counts[dataset.split == index])
@@ -48,6 +66,17 @@ def statistics_rows(
         yield dict.fromkeys(COLUMNS) | {"what": "paper's test set"} | shares
     for name, samples in (balanced_subsets(dataset) if subsets is None else subsets).items():
         yield _subset_row(name, dataset.labels, samples)
+
+
+def windows_table(provenance: Provenance) -> str:
+    """How each site was read, and how many of its windows are for each split or left out, and why."""
+    rows = [to_json(site) for site in provenance.sites]
+    totals = {name: sum(row[name] for row in rows) for name in list(WINDOW_COLUMNS)[4:]}
+    for row in rows:
+        row |= {"filled": f"{row['filled']:.3%}", "unknown": f"{row['unknown']:.1%}"}
+    if len(rows) > 1:
+        rows.append(dict.fromkeys(WINDOW_COLUMNS) | {"name": "all sites"} | totals)
+    return rows_table(rows, WINDOW_COLUMNS)
 
 
 def balanced_subsets(dataset: Dataset) -> dict[str, Samples]:

@@ -6,7 +6,8 @@
 
 One example is one map: `elevation` [rows, cols] float32 metres, NaN unknown; `labels` [t] uint8, of each trajectory's
 byte bits 0 to 2 say that step, obstacle and tilt failed, bit 3 unknown; `style`, or the site of a real map; `seed` of
-its terrain; `map`, its index in the data set. Robot, actions, grid and config are in the builder's metadata.
+its terrain; `map`, its index in the data set; of a real map `origin` and `quarter_turns` as in provenance.py. All that
+is not an array is in the builder's metadata.
 """
 
 import json
@@ -19,10 +20,19 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError, require
-from travjax.dataset import SPLITS, Dataset, configs_from_json, configs_to_json
+from travjax.dataset import SPLITS, Dataset, configs_to_json, put_together
 from travjax.files import folder_written_whole
 
 NAME, VERSION = "travjax", "1.0.0"
+
+ARRAY_OF = {
+    "elevation": "heights",
+    "labels": "labels",
+    "seed": "seed",
+    "origin": "origin",
+    "quarter_turns": "quarter_turns",
+}
+"""Which array of a data set a feature holds a row of."""
 
 METADATA = "metadata.json"
 """The file in which tensorflow-datasets keeps a builder's metadata."""
@@ -58,17 +68,17 @@ def read(folder: str | Path) -> Dataset:
     require(_is_export(Path(folder)), "folder", str(folder), f"one with an exported data set in {NAME}/{VERSION}")
     try:
         builder = tfds.builder_from_directory(place)
-        return _collected(builder, configs_from_json(builder.info.metadata))
+        return put_together(builder.info.metadata, _collected(builder))
     except Exception as error:  # a damaged record raises whatever the reader of its format does
         raise InputError(f"{place}: damaged: {' '.join(str(error).split()) or type(error).__name__}") from None
 
 
-def _collected(builder: Any, configs: dict[str, Any]) -> Dataset:
-    splits = builder.info.splits
+def _collected(builder: Any) -> dict[str, np.ndarray]:
+    """The arrays of the data set by name."""
+    splits, features = builder.info.splits, builder.info.features
     count = sum(split.num_examples for split in splits.values())
-    heights = np.empty((count, *configs["grid"].shape), np.float32)
-    labels = np.empty((count, len(configs["actions"])), np.uint8)
-    seed = np.empty(count, np.uint32)
+    kept = {array: name for name, array in ARRAY_OF.items() if name in features}
+    arrays = {array: np.empty((count, *features[name].shape), features[name].np_dtype) for array, name in kept.items()}
     split = np.full(count, len(SPLITS), np.uint8)  # no split: a map that is missing is found by it
     group = [""] * count
     for name in splits:
@@ -76,9 +86,10 @@ def _collected(builder: Any, configs: dict[str, Any]) -> Dataset:
         for place in range(len(source)):
             example = source[place]
             index = example["map"]
-            heights[index], labels[index], seed[index] = example["elevation"], example["labels"], example["seed"]
+            for array, feature in kept.items():
+                arrays[array][index] = example[feature]
             group[index], split[index] = example["style"].decode(), SPLITS.index(name)
-    return Dataset(heights, labels, np.array(group), seed, split, **configs)
+    return arrays | {"group": np.array(group), "split": split}
 
 
 def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], object] | None) -> type:
@@ -100,6 +111,10 @@ def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], obj
                 "seed": tfds.features.Scalar(np.uint32),
                 "map": tfds.features.Scalar(np.int64),
             }
+            if dataset.provenance:
+                # Numbers that are not kept as bytes lose half of their digits.
+                features["origin"] = tfds.features.Tensor(shape=(2,), dtype=np.float64, encoding="bytes")
+                features["quarter_turns"] = tfds.features.Scalar(np.uint8)
             return Information(
                 builder=self,
                 description="Elevation maps and which trajectories of a wheeled robot fail on them.",
@@ -127,13 +142,8 @@ def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], obj
 
 
 def _example(dataset: Dataset, index: int) -> dict[str, Any]:
-    return {
-        "elevation": dataset.heights[index],
-        "labels": dataset.labels[index],
-        "style": str(dataset.group[index]),
-        "seed": dataset.seed[index],
-        "map": index,
-    }
+    numbers = {name: dataset.arrays[array][index] for name, array in ARRAY_OF.items() if array in dataset.arrays}
+    return numbers | {"style": str(dataset.group[index]), "map": index}
 
 
 def _is_export(folder: Path) -> bool:

@@ -1,21 +1,30 @@
-"""`travjax dataset`: maps with all their labels and splits, made from one seed and kept in one folder."""
+"""`travjax dataset`: maps with all their labels and splits, synthetic or real, kept in one folder."""
 
 import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
-from travjax import tfds_builder, traverse
+from travjax import sites, tfds_builder, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import InputError, require
-from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, is_dataset, load, save
+from travjax.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
 from travjax.files import output_folder, written_whole
 from travjax.grid import Grid
+from travjax.provenance import SIDES, Site, SitesConfig, Strip
 from travjax.robot import Robot
-from travjax.statistics import statistics_table
+from travjax.statistics import statistics_table, windows_table
 
-MAKING = ("maps", "seed", "validation", "test", "robot", "actions", "size", "spacing", "out")
+SYNTHETIC = ("maps", "seed", "validation", "test")
+"""The options of a synthetic data set."""
+
+REAL = ("test_strip", "validation_strip", "gap", "max_unknown", "no_rotations", *options.DEM_OPTIONS)
+"""The options of DEM files."""
+
+MAKING = (*SYNTHETIC, "sites", "dem", "held_out", *REAL, "robot", "actions", "size", "spacing", "out")
 """The options of a data set that is made, not of one that is checked."""
 
 
@@ -24,8 +33,9 @@ def add(commands: options.Commands) -> None:
     parser = commands.add_parser(
         "dataset",
         help="make a data set for training",
-        description="Makes synthetic maps, the styles in turn, labels every trajectory, splits the maps, and keeps "
-        "all of it in one folder. The whole data set is in memory: 4 GB for the paper's 56840 maps.",
+        description="Makes synthetic maps, the styles in turn, or cuts real ones out of elevation maps; labels every "
+        "trajectory, splits the maps, and keeps all of it in one folder. The whole data set is in memory: 4 GB for the "
+        "paper's 56840 maps.",
     )
     config = DatasetConfig()
     parser.add_argument("--maps", type=int, default=config.maps, metavar="N", help=f"number of maps ({config.maps})")
@@ -37,6 +47,7 @@ def add(commands: options.Commands) -> None:
         parser.add_argument(
             f"--{name}", type=float, default=share, metavar="SHARE", help=f"share of the maps for {name} ({share:g})"
         )
+    _add_real(parser)
     options.add_robot(parser)
     options.add_grid(parser)
     options.add_out(parser, "runs/dataset")
@@ -49,33 +60,53 @@ def add(commands: options.Commands) -> None:
     parser.set_defaults(run=run, making={name: parser.get_default(name) for name in MAKING})
 
 
+def _add_real(parser: argparse.ArgumentParser) -> None:
+    config = SitesConfig((Site("none"),))
+    parser.add_argument(
+        "--sites", type=Path, metavar="FILE", help="real maps: .toml file with a [[site]] for each elevation map"
+    )
+    parser.add_argument("--dem", nargs="+", default=[], metavar="FILE", help="real maps: elevation maps to train on")
+    parser.add_argument(
+        "--held-out", nargs="+", default=[], metavar="FILE", help="real maps: elevation maps for the test alone"
+    )
+    for split in ("test", "validation"):
+        parser.add_argument(
+            f"--{split}-strip",
+            nargs=2,
+            metavar=("SIDE", "M"),
+            help=f"for {split}: the windows within M metres of a side ({', '.join(SIDES)}) of each --dem file",
+        )
+    parser.add_argument(
+        "--gap", type=float, metavar="M", help=f"metres around test windows to train on nothing ({config.gap:g})"
+    )
+    parser.add_argument(
+        "--max-unknown",
+        type=float,
+        metavar="SHARE",
+        help=f"share of unknown nodes above which a window is left out ({config.max_unknown:g})",
+    )
+    parser.add_argument(
+        "--no-rotations", action="store_true", help="no training windows turned by 90, 180 and 270 degrees"
+    )
+    options.add_dem(parser, config.stride)
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Makes and saves a data set or checks one, prints what it holds, and exports it if that is asked for."""
     folder = arguments.check or arguments.out
     if arguments.check:
-        for name, default in arguments.making.items():
-            given = getattr(arguments, name)
-            require(given == default, f"--{name}", given, "left out where --check is given")
+        _require_left_out(arguments, MAKING, "--check is given")
     if arguments.tfds:
         outside = not arguments.tfds.resolve().is_relative_to(folder.resolve())
         require(outside, "--tfds", str(arguments.tfds), f"a folder outside the data set, {folder}")
-    if arguments.check:
-        dataset = load(folder)
-    else:
-        grid, robot, actions = options.configuration(arguments)
-        config = DatasetConfig(arguments.maps, arguments.seed, arguments.validation, arguments.test)
-        dataset = made(config, robot, actions, grid, folder)
-    as_in_paper = dataset.config is not None and traverse.as_in_paper(dataset.robot, dataset.actions)
-    table = statistics_table(dataset, as_in_paper=as_in_paper)
-    sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
-    trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
-    print(f"\n{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:\n{table}\n")
+    dataset = load(folder) if arguments.check else _made(arguments, folder)
+    tables = _print_tables(dataset)
     if arguments.check:
         print(f"{folder}: all files are as they were written")
     else:
         statistics = folder.with_name(f"{folder.name}_statistics.txt")  # the folder holds the data set alone
         with written_whole(statistics) as temporary:
-            temporary.write_text(table + "\n")
+            temporary.write_text("\n\n".join(tables) + "\n")
         print(folder, statistics, sep="\n")
     if arguments.tfds:
         with tqdm(desc="exporting", total=len(dataset.split), unit="map") as bar:
@@ -83,15 +114,95 @@ def run(arguments: argparse.Namespace) -> None:
         print(arguments.tfds)
 
 
+def _print_tables(dataset: Dataset) -> list[str]:
+    """Prints and returns the shares that fail and, of real maps, what became of the windows."""
+    as_in_paper = dataset.config is not None and traverse.as_in_paper(dataset.robot, dataset.actions)
+    tables = [statistics_table(dataset, as_in_paper=as_in_paper)]
+    sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
+    trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
+    print(f"\n{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:\n{tables[0]}\n")
+    if dataset.provenance:
+        tables.append(windows_table(dataset.provenance))
+        copies = int((dataset.provenance.quarter_turns > 0).sum())
+        print(f"Windows of the sites, beside which {copies} maps are turned copies:\n{tables[1]}\n")
+    return tables
+
+
+def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
+    """The data set that is asked for, saved."""
+    files = bool(arguments.dem or arguments.held_out)
+    if arguments.sites:
+        _require_left_out(arguments, (*SYNTHETIC, "dem", "held_out", *REAL), "--sites is given")
+    elif files:
+        _require_left_out(arguments, SYNTHETIC, "DEM files are given")
+    else:
+        _require_left_out(arguments, REAL, "no DEM file is given")
+    real = SitesConfig.load(arguments.sites) if arguments.sites else _sites(arguments) if files else None
+    synthetic = None if real else DatasetConfig(*(getattr(arguments, name) for name in SYNTHETIC))
+    grid, robot, actions = options.configuration(arguments)
+    if real:
+        return made_of_sites(real, robot, actions, grid, folder)
+    assert synthetic
+    return made(synthetic, robot, actions, grid, folder)
+
+
+def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where: str) -> None:
+    for name in names:
+        given = getattr(arguments, name)
+        require(given == arguments.making[name], f"--{name.replace('_', '-')}", given, f"left out where {where}")
+
+
+def _sites(arguments: argparse.Namespace) -> SitesConfig:
+    """The sites of DEM files."""
+    settings = options.dem_settings(arguments)
+    read = {name: settings.pop(name) for name in ("cell_size", "height_scale", "nodata")}
+    strips: dict[str, Any] = {
+        name: _strip(name, getattr(arguments, name)) for name in ("test_strip", "validation_strip")
+    }
+    if not arguments.dem:
+        _require_left_out(arguments, tuple(strips), "no --dem file is given")
+    given = {name: getattr(arguments, name) for name in ("gap", "max_unknown")}
+    return SitesConfig(
+        (
+            *(Site(file, **strips, **read) for file in arguments.dem),
+            *(Site(file, split="test", **read) for file in arguments.held_out),
+        ),
+        rotations=not arguments.no_rotations,
+        **{name: value for name, value in given.items() if value is not None},
+        **settings,
+    )
+
+
+def _strip(name: str, given: list[str] | None) -> Strip:
+    if not given:
+        return ()
+    try:
+        return given[0], float(given[1])
+    except ValueError:
+        raise InputError(f"--{name.replace('_', '-')} = {' '.join(given)}: must be a side, then metres") from None
+
+
 def made(config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
-    """A new data set, saved in a folder, with progress bars."""
+    """A new synthetic data set, saved in a folder, with progress bars."""
+    make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
+    return _saved(make, config.maps, folder, f"--maps = {config.maps}")
+
+
+def made_of_sites(config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
+    """A new data set of real maps, saved in a folder, with progress bars."""
+    make = lambda on_progress: sites.read(config, robot, actions, grid, on_progress)
+    return _saved(make, None, folder, "the sites' windows")
+
+
+def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path, what: str) -> Dataset:
+    """What `make` makes; `total` maps, if that is known before."""
     _require_free(folder)
     try:
-        with tqdm(desc="making", total=config.maps, unit="map") as bar:
-            dataset = generate(config, robot, actions, grid, bar.update)
+        with tqdm(desc="making", total=total, unit="map") as bar:
+            dataset = make(bar.update)
     except MemoryError as error:
-        raise InputError(f"--maps = {config.maps}: do not fit in memory: {error}") from None
-    size = sum(getattr(dataset, name).nbytes for name in ARRAYS)
+        raise InputError(f"{what}: do not fit in memory: {error}") from None
+    size = sum(array.nbytes for array in dataset.arrays.values())
     with tqdm(desc="saving", total=size, unit="B", unit_scale=True) as bar:
         # The files' headers are not in the total.
         save(dataset, folder, lambda added: bar.update(min(added, size - bar.n)))
