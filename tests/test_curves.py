@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 from matplotlib.colors import same_color
 from test_plots import colours, pixels, within
+from test_transfer_scores import results
 
 from travjax import curves
 from travjax.grid import Grid
 from travjax.metrics import NAMES, PAPER_REAL, PAPER_SYNTHETIC, Evaluation, evaluate
+from travjax.transfer_scores import Results
 from travjax.traverse import EVENTS
 
 GRID = Grid(8.0, 0.125)
@@ -215,3 +217,26 @@ def test_every_name_has_a_colour_of_its_own():
     assert list(curves.COLOURS) == list(NAMES)
     used = [*curves.COLOURS.values(), *curves.BASELINES]
     assert not any(same_color(one, other) for k, one in enumerate(used) for other in used[:k])
+
+
+# ---- The transfer experiment
+
+
+def test_the_f1_of_each_arm_is_drawn_with_the_band_of_its_seeds_and_the_predictor_that_always_fails(tmp_path):
+    rows = results().arms["random"]
+    made = Results({"random": rows, "ImageNet": {0: rows[1]}})
+    figure = curves.transfer_figure(made, {"random": "tab:gray", "ImageNet": "tab:blue"})
+    image = pixels(figure, tmp_path)
+    assert [ax.get_title().split(":")[0] for ax in figure.axes] == made.sites
+    for ax, site in zip(figure.axes, made.sites, strict=True):
+        drawn = labelled_lines(ax)
+        f1 = made.f1("random", site)
+        np.testing.assert_allclose(drawn["random"], ([0, 1, 2], f1.mean(axis=0)))
+        np.testing.assert_allclose(drawn["ImageNet"][1], f1[1])
+        assert set(drawn["always fails"][1]) == {made.always(site).f1}
+        band = ax.collections[0].get_paths()[0].vertices
+        for epoch in range(3):
+            edges = band[band[:, 0] == epoch, 1]
+            assert (edges.min(), edges.max()) == pytest.approx((f1[:, epoch].min(), f1[:, epoch].max()))
+        assert colours(within(ax, image)) > 20
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [*made.arms, "always fails"]

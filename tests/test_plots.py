@@ -260,7 +260,7 @@ def predicted(probabilities: np.ndarray, failed: np.ndarray, known: np.ndarray) 
     """The figure of maps of random ground, on few actions."""
     heights = np.random.default_rng(0).standard_normal((len(failed), *GRID.shape)).astype(np.float32)
     names = [f"map {number}" for number in range(len(failed))]
-    return plots.predicted_maps(heights, probabilities, failed, known, names, SEEKUR_JR, FEW, GRID)
+    return plots.predicted_maps(heights, {"predicted": probabilities}, failed, known, names, SEEKUR_JR, FEW, GRID)
 
 
 def of_event(figure: Figure, event: str) -> tuple:
@@ -292,6 +292,24 @@ def test_predictions_have_three_colours_over_the_truth_with_two_and_unknown(tmp_
     for ax in (above, below):
         assert count_of(within(ax, image), "failed") > 100
         assert count_of(within(ax, image), "safe") > 100
+
+
+def test_several_predictions_stand_below_each_other_and_the_truth_is_last(tmp_path):
+    known, failed = np.ones((2, 36), bool), np.zeros((2, 36, 3), bool)
+    failed[1] = True
+    before, after = np.full((2, 36, 3), 0.9), np.full((2, 36, 3), 0.1)
+    heights = np.zeros((2, *GRID.shape), np.float32)
+    names, predictions = ["one", "two"], {"before": before, "after": after}
+    figure = plots.predicted_maps(heights, predictions, failed, known, names, SEEKUR_JR, FEW, GRID)
+    pixels(figure, tmp_path)
+    shown = [ax for ax in figure.axes if ax.get_title().startswith("tilt, ")]
+    assert [ax.get_title().split(":")[0] for ax in shown] == ["tilt, before", "tilt, after", "tilt, true"] * 2
+    assert [*map(paths, shown)] == [{"failed": 36}, {"safe": 36}, {"safe": 36}] + [
+        {"failed": 36},
+        {"safe": 36},
+        {"failed": 36},
+    ]
+    assert sorted(shown, key=lambda ax: -ax.get_window_extent().y0) == shown
 
 
 def test_the_trajectory_that_is_predicted_to_fail_turns_red():

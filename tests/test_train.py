@@ -37,7 +37,9 @@ from travjax.config import InputError
 from travjax.curves import training_figure
 from travjax.estimator import HeadsConfig, create, put_together, take_apart
 from travjax.inputs import ImageSource, render_inputs, trajectory_bank
-from travjax.sampling import balanced_subset
+from travjax.parallel import Devices
+from travjax.prediction import probabilities
+from travjax.sampling import balanced_subset, every_sample
 from travjax.train import Trainer
 from travjax.trained import TRAINED, load_estimator
 from travjax.training_step import update
@@ -233,10 +235,73 @@ def test_the_features_of_the_frozen_trunk_are_those_of_a_forward_pass(tmp_path):
     made.start(put_together(*take_apart(estimator(1))))
     for name, samples in (("training", made.data.samples(1, 0)), ("validation", made.data.validation)):
         wanted = features_of(*take_apart(estimator(1)), images_of(samples))
-        np.testing.assert_allclose(made._features[name], wanted, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(made.features[name], wanted, rtol=1e-4, atol=1e-5)
+
+
+def test_features_of_another_run_of_the_same_trunk_may_be_set(tmp_path, monkeypatch):
+    first = begun(tmp_path / "first", head_epochs=1, epochs=0)
+    features = first.features
+    first.train()
+    monkeypatch.setattr("travjax.train.over_samples", None)  # what would compute them
+    second = begun(tmp_path / "second", head_epochs=1, epochs=0)
+    second.features = features
+    second.train()
+    assert rows_of(tmp_path / "first") == rows_of(tmp_path / "second")
+
+
+# ---- Watched samples
+
+
+def watched() -> dict[str, tuple]:
+    """All trajectories of two test maps, and of one."""
+    test = dataset().maps_of("test")
+    return {"two": every_sample(dataset().labels, test[:2]), "one": every_sample(dataset().labels, test[2:3])}
+
+
+@pytest.mark.parametrize("phases", [{"head_epochs": 2, "epochs": 0}, {"head_epochs": 0, "epochs": 2}])
+def test_watched_samples_are_scored_before_training_and_after_each_epoch(tmp_path, phases):
+    made = Trainer(run_of(**phases), dataset(), tmp_path, Devices.all(), quiet=True, watched=watched())
+    made.start(create(PRESET.trunk, PRESET.heads, 0))
+    states = [host(made._variables)]
+    made._train_epoch, train = lambda: (train(), states.append(host(made._variables))), made._train_epoch
+    made.train()
+    rows = [row for row in rows_of(tmp_path) if "watched" in row]
+    assert [row["epoch"] for row in rows] == [0, 1, 2]
+    assert rows[0]["step"] == 0
+    graph = made.graph
+    for row, state in zip(rows, states, strict=True):
+        for name, samples in watched().items():
+            variables = jax.tree.unflatten(jax.tree.structure(made._variables), list(state.values()))
+            probability = probabilities(np.asarray(forward(graph, variables, images_of(samples))))
+            wanted = metrics.confusions(probability, made.data.failed(samples).astype(bool))
+            for event, counts in wanted.items():
+                assert row["watched"][name][event]["confusion"] == metrics.to_json(counts)
+
+
+def test_training_does_not_depend_on_watched_samples(tmp_path):
+    begun(tmp_path / "without").train()
+    made = Trainer(run_of(), dataset(), tmp_path / "with", Devices.all(), quiet=True, watched=watched())
+    (tmp_path / "with").mkdir()
+    made.start(create(PRESET.trunk, PRESET.heads, made.config.seed))
+    made.train()
+    require_equal(saved_state(tmp_path / "without"), saved_state(tmp_path / "with"))
+    rows = [{name: value for name, value in row.items() if name != "watched"} for row in rows_of(tmp_path / "with")]
+    assert rows[1:] == rows_of(tmp_path / "without")
 
 
 # ---- Samples
+
+
+def test_runs_of_other_seeds_train_on_the_same_samples_where_a_seed_of_the_subset_is_given(tmp_path):
+    datas = [trainer(tmp_path, seed=seed, subset_seed=7, fresh=False).data for seed in (0, 1)]
+    drawn = [[data.samples(1, 0), data.samples(2, 1), data.validation] for data in datas]
+    for one, other in zip(*drawn, strict=True):
+        np.testing.assert_array_equal(one, other)
+    orders = [np.concatenate([places for places, _, _ in data.batches(1, 0)]) for data in datas]
+    assert not np.array_equal(*orders)
+    alone = trainer(tmp_path, seed=7, fresh=False).data
+    np.testing.assert_array_equal(alone.samples(1, 0), datas[0].samples(1, 0))
+    np.testing.assert_array_equal(alone.validation, datas[0].validation)
 
 
 def test_fresh_samples_are_others_in_each_epoch_of_the_second_phase(tmp_path):

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from travjax.grid import Grid
 from travjax.metrics import NAMES, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
+from travjax.transfer_scores import Results
 
 COLOURS = dict(zip(NAMES, ("tab:blue", "tab:orange", "tab:purple", "black"), strict=True))
 BASELINES = ("tab:brown", "tab:olive", "tab:cyan", "tab:pink", "tab:gray")
@@ -149,6 +150,29 @@ def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
 
 
 _PHASE = dict(xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8, color="0.4")
+
+
+def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
+    """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+
+    arms: their colours. Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
+    """
+    figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
+    for ax, site in zip(axes, results.sites, strict=True):
+        for arm, colour in arms.items():
+            f1 = np.nan_to_num(results.f1(arm, site))
+            epochs = np.arange(f1.shape[1])
+            ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+            ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
+        always = results.always(site)
+        ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
+        ax.set_title(f"{site}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
+        ax.set(xlabel="epoch on real maps", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    axes[0].legend(fontsize=9)
+    return figure
 
 
 def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid = Grid()) -> Figure:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from travjax import metrics
+from travjax import labelling, metrics
 from travjax.baselines import LogisticRegression, slope_and_step
 from travjax.config import require
 from travjax.dataset import Dataset, require_same
@@ -71,6 +71,22 @@ class Evaluator:
         variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
         logits = over_samples(sample_logits, graph, variables, self.source, samples, self.devices, size, on_progress)
         return probabilities(logits)
+
+    def to_show(self, count: int, group: str | None = None) -> np.ndarray:
+        """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""
+        data = self.dataset
+        test = data.maps_of("test")
+        test = test if group is None else test[data.group[test] == group]
+        failed, known = map(np.asarray, unpacked(data.labels[test]))
+        return test[labelling.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
+
+    def whole_maps(
+        self, estimator: Estimator, maps: np.ndarray, on_progress: Progress = lambda count: None
+    ) -> np.ndarray:
+        """Probabilities of all trajectories of maps [k]: [k, t, 3]."""
+        trajectories = len(self.run.actions)
+        samples = (np.repeat(maps, trajectories), np.tile(np.arange(trajectories), len(maps)))
+        return self.probabilities(estimator, samples, on_progress).reshape(len(maps), trajectories, -1)
 
     def regression(self, samples: Samples) -> np.ndarray:
         """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""

@@ -3,7 +3,7 @@
 Functions return a matplotlib Figure; `save` writes it. Nothing here needs a display.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +90,7 @@ def labelled_maps(
 
 def predicted_maps(
     heights: np.ndarray,
-    probabilities: np.ndarray,
+    predictions: Mapping[str, np.ndarray],
     failed: np.ndarray,
     known: np.ndarray,
     titles: Sequence[str],
@@ -98,27 +98,32 @@ def predicted_maps(
     actions: ActionSpace,
     grid: Grid,
 ) -> Figure:
-    """For each map the elevation and, for each event, the action space as predicted and below it the truth.
+    """For each map the elevation and, for each event, the action space as predicted and in the last row the truth.
 
-    heights: [n, rows, cols]; probabilities, failed: [n, t, 3]; known: [n, t]. The paper's qualitative figure.
+    heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3]; known: [n, t].
+    The paper's qualitative figure.
     """
     paths = actions.poses(np.arange(len(actions)))[..., :2]
-    figure = Figure(figsize=(13, 6.3 * len(heights) + 0.5), layout="constrained")
-    axes = figure.subplots(2 * len(heights), 4, sharex=True, sharey=True, squeeze=False)
-    for one, (left, *above), (corner, *below) in zip(range(len(heights)), axes[::2], axes[1::2], strict=True):
+    rows = len(predictions) + 1
+    figure = Figure(figsize=(13, 3.15 * rows * len(heights) + 0.5), layout="constrained")
+    axes = figure.subplots(rows * len(heights), 4, sharex=True, sharey=True, squeeze=False)
+    for one in range(len(heights)):
+        of_map = axes[rows * one : rows * (one + 1)]
+        left = of_map[0, 0]
         image = _draw_elevation(left, heights[one], grid, *_colour_range(heights[one]))
         _draw_robot(left, robot)
         figure.colorbar(image, ax=left, shrink=0.85, label="elevation [m]")
         left.set_title(titles[one], fontsize=9)
         left.set_ylabel("y, forward [m]")
         left.tick_params(labelbottom=True)
-        corner.axis("off")
+        for ax in of_map[1:, 0]:
+            ax.axis("off")
         for event, name in enumerate(EVENTS):
-            predicted, fails = probabilities[one, :, event], failed[one, :, event]
-            for ax, what, mask, by_colour in (
-                (above[event], "predicted", predicted >= FAILURE, _by_probability(predicted, known[one])),
-                (below[event], "true", fails, _by_label(fails, known[one])),
-            ):
+            fails = failed[one, :, event]
+            columns = [(what, values[one, :, event]) for what, values in predictions.items()]
+            drawn = [(what, p >= FAILURE, _by_probability(p, known[one])) for what, p in columns]
+            drawn.append(("true", fails, _by_label(fails, known[one])))
+            for ax, (what, mask, by_colour) in zip(of_map[:, 1 + event], drawn, strict=True):
                 _draw_elevation(ax, heights[one], grid, *_colour_range(heights[one]), colour="gray", alpha=0.35)
                 _draw_paths(ax, paths, by_colour)
                 ax.set_title(_share_title(f"{name}, {what}", mask, known[one]), fontsize=9)
@@ -291,4 +296,22 @@ def speed_figure(rows: list[dict]) -> Figure:
     ax.yaxis.set_minor_formatter("{x:g}")
     ax.grid(alpha=0.3, which="both")
     ax.legend()
+    return figure
+
+
+def timing_figure(rows: list[dict]) -> Figure:
+    """Seconds for all trajectories of a map as bars, from the rows of the experiment `timing`; grey: the paper's."""
+    figure = Figure(figsize=(9, 0.6 * len(rows) + 1.2), layout="constrained")
+    ax = figure.subplots()
+    names = [f"{row['what']}\n{row['device']}" for row in rows]
+    colours = ["tab:gray" if row["what"].startswith("paper") else "tab:blue" for row in rows]
+    bars = ax.barh(names, [row["seconds"] for row in rows], color=colours, height=0.65)
+    ax.bar_label(bars, [f"{row['seconds']:.3g} s" for row in rows], padding=3)
+    ax.invert_yaxis()
+    ax.set_xscale("log")
+    ax.margins(x=0.12)
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.set_xlabel("s a map (median)")
+    ax.tick_params(axis="y", labelsize=8)
+    ax.grid(alpha=0.3, axis="x")
     return figure

@@ -1,14 +1,14 @@
 """Everything that a training run is made from, as one TOML file (experiments/train/*.toml)."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import optax
 
-from travjax.config import InputError, load_toml, require, require_number
+from travjax.config import load_toml, require, require_number
 from travjax.dataset import DatasetConfig
 from travjax.estimator import HeadsConfig
+from travjax.files import find_data
 from travjax.resnet import ResNetConfig
 
 SCHEDULES = ("constant", "cosine")
@@ -34,6 +34,7 @@ class TrainingConfig:
     weight_decay:         times the sum of squares of the heads' kernels, added to the loss
     each, failing:        trajectories a map in an epoch, and how many of them fail if as many do
     fresh:                a new subset of trajectories each epoch instead of the same one (phase 2)
+    subset_seed:          of the subsets alone, so that runs of other seeds train on the same samples; `seed` if none
     validation_samples:   at most this many of the validation maps' balanced subset
     checkpoint_steps:     steps from one checkpoint to the next; there is one after each epoch as well
 
@@ -53,13 +54,18 @@ class TrainingConfig:
     each: int = 11
     failing: int = 6
     fresh: bool = False
+    subset_seed: int | None = None
     validation_samples: int = 100_000
     checkpoint_steps: int = 500
 
     def __post_init__(self):
         _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing", least=0)
         _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
-        require(self.seed < 2**31, "seed", self.seed, f"at most {2**31 - 1}")
+        if self.subset_seed is not None:
+            _require_counts(self, "subset_seed", least=0)
+        for name in ("seed", "subset_seed"):
+            value = getattr(self, name)
+            require(value is None or value < 2**31, name, value, f"at most {2**31 - 1}")
         require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
         require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
         require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
@@ -68,6 +74,11 @@ class TrainingConfig:
         require(self.schedule in SCHEDULES, "schedule", self.schedule, f"one of {', '.join(SCHEDULES)}")
         require(type(self.fresh) is bool, "fresh", self.fresh, "true or false")
         require(self.head_epochs + self.epochs > 0, "epochs", self.epochs, "at least 1 where head_epochs is 0")
+
+    @property
+    def drawn_by(self) -> int:
+        """The seed of the subsets."""
+        return self.seed if self.subset_seed is None else self.subset_seed
 
     def schedule_of(self, phase: int, steps: int) -> optax.Schedule:
         """The learning rate of each of the `steps` of a phase; it varies in phase 2 only."""
@@ -131,12 +142,4 @@ class Preset:
 
 def find_weights(name: str) -> Path | None:
     """The file of a preset's `weights`, None for "none"; raises InputError when there is none."""
-    if name == "none":
-        return None
-    data = os.environ.get("TRAVJAX_DATA")
-    places = [Path(name)] + ([Path(data) / name] if data else [])
-    for place in places:
-        if place.is_file():
-            return place
-    where = f"nor under TRAVJAX_DATA={data}" if data else "and TRAVJAX_DATA is not set"
-    raise InputError(f"weights {name}: no such file here, {where}; allowed: --weights FILE, or none for random ones")
+    return None if name == "none" else find_data(name, "weights", "--weights FILE, or none for random ones")

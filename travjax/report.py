@@ -72,7 +72,7 @@ def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None 
             rows.append(["  paper", *_figures(paper[name]), "", "", *_counts(paper[name])])
             notes.append(_why_undefined(f"{name} in the paper", paper[name]))
     headers = ["", "accuracy", "recall", "precision", "F1", "failures", "AP", "ECE", "TN", "FP", "FN", "TP"]
-    return _with_notes(_table(rows, headers), notes)
+    return with_notes(_table(rows, headers), notes)
 
 
 def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
@@ -87,7 +87,7 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
             rows.append([name, f"{point.wanted:.3f}", *(["-"] * 5 if math.isnan(point.threshold) else figures), beside])
         notes.append(_why_undefined(name, points[0].confusion))
     headers = ["", "wanted recall", "threshold", "recall", "precision", "F1", "predicted to fail", "paper's precision"]
-    return _with_notes(_table(rows, headers), notes)
+    return with_notes(_table(rows, headers), notes)
 
 
 def groups_table(evaluation: Evaluation) -> str:
@@ -108,7 +108,7 @@ def groups_table(evaluation: Evaluation) -> str:
     ]
     headers = [title.replace(" ", "\n") for title in ("", "samples", *per_event)]
     notes = [f"{event}: no sample fails in {', '.join(names)}" for event, names in undefined.items() if names]
-    return _with_notes(_table(rows, headers), notes)
+    return with_notes(_table(rows, headers), notes)
 
 
 def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
@@ -117,7 +117,7 @@ def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
     undefined = [name for name in columns if any(math.isnan(values[name]) for values in rows.values())]
     cells = [[predictor, *(_share(values[name]) for name in columns)] for predictor, values in rows.items()]
     notes = [f"{name}: no sample fails, so average precision is undefined" for name in undefined]
-    return _with_notes(_table(cells, ["average precision", *columns]), notes)
+    return with_notes(_table(cells, ["average precision", *columns]), notes)
 
 
 def _figures(counts: Confusion) -> list[str]:
@@ -150,6 +150,6 @@ def _table(rows: list[list[str]], headers: Sequence[str]) -> str:
     return tabulate(rows, headers, disable_numparse=True, stralign="right", colalign=("left",))
 
 
-def _with_notes(table: str, notes: Iterable[str]) -> str:
+def with_notes(table: str, notes: Iterable[str]) -> str:
     """The table and below it what its dashes mean."""
     return "\n".join([table, *(f"- {note}" for note in notes if note)])

@@ -8,7 +8,7 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -61,17 +61,28 @@ class Trainer:
     """One training run.
 
     data: what is trained on; state: that of training_step.py; position: where it stands
+    watched: named samples on which each epoch is scored beside the validation, and the first state; training does not
+        depend on them
     Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
     validation samples, or when the devices cannot share a batch.
     """
 
-    def __init__(self, run: Run, dataset: Dataset, folder: Path, devices: Devices, quiet: bool = False):
+    def __init__(
+        self,
+        run: Run,
+        dataset: Dataset,
+        folder: Path,
+        devices: Devices,
+        quiet: bool = False,
+        watched: Mapping[str, Samples] | None = None,
+    ):
         require_same(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
         self.run, self.folder, self.devices = run, folder, devices
         self.config = run.preset.training
         self.data = TrainingData(dataset, self.config)
         self.quiet = quiet or not devices.main
+        self.scored = {"validation": self.data.validation} | dict(watched or {})
         self.checkpoints = Checkpoints(folder / "checkpoints")
         self.position = Position()
         self._optimizers: dict[int, optax.GradientTransformation] = {}
@@ -88,9 +99,10 @@ class Trainer:
         return self.devices.replicate(source)
 
     @cached_property
-    def _features(self) -> dict[str, np.ndarray]:
-        """The frozen trunk's features of the samples of phase 1, computed once."""
-        samples = {"training": self.data.samples(1, 0), "validation": self.data.validation}
+    def features(self) -> dict[str, np.ndarray]:
+        """The frozen trunk's features of the samples of phase 1, computed once; those of a run of the same trunk and
+        samples may be set instead."""
+        samples = {"training": self.data.samples(1, 0)} | self.scored
         return {name: self._over(sample_features, part, f"{name} features") for name, part in samples.items()}
 
     def start(self, estimator: Estimator) -> None:
@@ -122,6 +134,8 @@ class Trainer:
         if self.devices.main:
             self.log = RunLog(self.folder, self.position.total)
         try:
+            if not self.position.total and (row := self._watched()) and self.log:
+                self.log.write({"step": 0, "phase": self.position.phase, "epoch": 0} | row)
             while self.position.phase == 1:
                 if self.position.epoch == self.config.head_epochs:
                     self.checkpoints.save_named("heads", self._variables, self._meta(optimizer=0))
@@ -136,7 +150,7 @@ class Trainer:
 
     def _begin(self, phase: int) -> None:
         """A new optimizer, for what the phase trains."""
-        self.__dict__.pop("_features", None)  # gigabytes for a large data set
+        self.__dict__.pop("features", None)  # gigabytes for a large data set
         self.position.phase, self.position.epoch = phase, 0
         trained = {name: self.state[name] for name in TRAINED[phase]}
         optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
@@ -183,7 +197,7 @@ class Trainer:
         """What a step of this epoch takes, from the places of its samples; features are computed if need be."""
         here = self.position
         if here.phase == 1:
-            features = self._features["training"]
+            features = self.features["training"]
             return lambda places: features[places]
         maps, trajectories = self.data.samples(here.phase, here.epoch)
         return lambda places: (maps[places], trajectories[places])
@@ -222,7 +236,7 @@ class Trainer:
 
     def _finish_epoch(self, rate: float) -> None:
         here = self.position
-        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated()}
+        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated(), **self._watched()}
         overall = row["average_precision"]["overall"] or 0.0
         best, here.best = overall > here.best, max(here.best, overall)
         self._report(row)
@@ -232,13 +246,7 @@ class Trainer:
 
     def _validated(self) -> dict[str, Any]:
         """Loss, that of the best constant predictor, average precision and F1 on the validation samples."""
-        if self.position.phase == 1:
-            features = self.devices.replicate(self._features["validation"])
-            logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
-        else:
-            logits = self._over(sample_logits, self.data.validation, "validation")
-        if not np.isfinite(logits).all():
-            raise self._diverged("a validation logit that is no number", self.position.step)
+        logits = self._logits("validation")
         failed = self.data.failed(self.data.validation)
         share = failed.mean(axis=0, dtype=np.float64)
         constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
@@ -249,6 +257,24 @@ class Trainer:
             "average_precision": metrics.to_json(scores.average_precision),
             "f1": metrics.to_json(scores.f1),
         }
+
+    def _watched(self) -> dict[str, Any]:
+        """Confusion and average precision of each event, and overall, on the watched samples."""
+        names = [name for name in self.scored if name != "validation"]
+        failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
+        scores = {name: metrics.evaluate(probabilities(self._logits(name)), failed[name]).scores for name in names}
+        return {"watched": metrics.to_json(scores)} if names else {}
+
+    def _logits(self, name: str) -> np.ndarray:
+        """Of the samples of that name, by the present state: [k, 3]."""
+        if self.position.phase == 1:
+            features = self.devices.replicate(self.features[name])
+            logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
+        else:
+            logits = self._over(sample_logits, self.scored[name], name)
+        if not np.isfinite(logits).all():
+            raise self._diverged(f"a {name} logit that is no number", self.position.step)
+        return logits
 
     def summary(self) -> str:
         """One line: what is trained on what."""

@@ -97,6 +97,12 @@ def _settings(mine: Any, other: Any, prefix: str = ""):
             yield name, ours, theirs
 
 
+def has_checkpoints(folder: Path) -> bool:
+    """Whether training has begun in the folder: it holds a checkpoint, whole or not."""
+    checkpoints = folder / "checkpoints"
+    return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
+
+
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Estimator, dict]:
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 

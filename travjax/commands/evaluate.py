@@ -2,7 +2,9 @@
 
 import argparse
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
@@ -10,6 +12,20 @@ from tqdm import tqdm
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder, written_whole
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from travjax.estimator import Estimator
+    from travjax.evaluate import Evaluator
+    from travjax.metrics import Confusion, Evaluation
+    from travjax.sampling import Samples
+
+RECALLS = (0.9, 0.99)
+"""Recalls that thresholds are found for, unless others are asked for."""
+
+FIGURE_MAPS = 2
+"""Maps in predictions.png, likewise."""
 
 CALIBRATION = (
     "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by "
@@ -33,9 +49,9 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("--maps", type=int, metavar="N", help="random test maps, 0 for all (as the preset says)")
     parser.add_argument("--each", type=int, metavar="N", help="random trajectories of each, 0 for all (likewise)")
     parser.add_argument(
-        "--recall", type=float, nargs="+", default=[0.9, 0.99], metavar="R", help="recalls to find thresholds for"
+        "--recall", type=float, nargs="+", default=RECALLS, metavar="R", help="recalls to find thresholds for"
     )
-    parser.add_argument("--figure-maps", type=int, default=2, metavar="N", help="maps in predictions.png (2)")
+    parser.add_argument("--figure-maps", type=int, default=FIGURE_MAPS, metavar="N", help="maps in predictions.png (2)")
     parser.add_argument("--no-baselines", action="store_true", help="without the two predictors to beat")
     parser.add_argument(
         "--out",
@@ -47,43 +63,74 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluates, prints the tables and writes them with the figures."""
-    from travjax import dataset
-    from travjax.evaluate import Evaluator
-    from travjax.parallel import Devices
-    from travjax.trained import DATA, load_estimator
-
-    _check(arguments)
-    trained, estimator, meta = load_estimator(arguments.folder, arguments.checkpoint)
-    evaluator = Evaluator.of(trained, dataset.load(arguments.data or arguments.folder / DATA), Devices.all())
-    name = "evaluation" if arguments.checkpoint == "best" else f"evaluation_{arguments.checkpoint}"
-    out = output_folder(arguments.out or arguments.folder / name)
-    sampled = trained.preset.evaluation
-    maps = sampled.maps if arguments.maps is None else arguments.maps
-    samples = evaluator.samples(maps, sampled.each if arguments.each is None else arguments.each)
-    of_network = _probabilities(evaluator, estimator, samples, "test samples")
-    scores = evaluator.scores(of_network, samples, arguments.recall)
-    others = {}
-    if not arguments.no_baselines:
-        others = _baselines(arguments.folder, evaluator, samples, arguments.recall)
-    _write_tables(out, scores, others, _description(evaluator, samples, arguments, meta), evaluator.paper)
-    _draw(out, evaluator, estimator, scores, others, arguments.figure_maps)
-
-
-def _check(arguments: argparse.Namespace) -> None:
+    """Evaluates."""
     for name in ("maps", "each", "figure_maps"):
         value = getattr(arguments, name)
         require(value is None or value >= 0, f"--{name.replace('_', '-')}", value, "at least 0")
     for recall in arguments.recall:
         require(0 < recall <= 1, "--recall", recall, "above 0 and at most 1")
+    evaluate(
+        arguments.folder,
+        arguments.data,
+        arguments.checkpoint,
+        arguments.out,
+        maps=arguments.maps,
+        each=arguments.each,
+        recalls=arguments.recall,
+        figure_maps=arguments.figure_maps,
+        baselines=not arguments.no_baselines,
+    )
 
 
-def _probabilities(evaluator, estimator, samples, what: str):
+def evaluate(
+    folder: Path,
+    data: Path | None = None,
+    checkpoint: str = "best",
+    out: Path | None = None,
+    *,
+    maps: int | None = None,
+    each: int | None = None,
+    recalls: Sequence[float] = RECALLS,
+    figure_maps: int = FIGURE_MAPS,
+    baselines: bool = True,
+) -> "Evaluation":
+    """Evaluates a training run, prints the tables and writes them with the figures; returns the network's figures.
+
+    data:       folder of a data set, instead of the run's own
+    checkpoint: "best", "latest" or "heads"
+    out:        folder to write to, instead of one in that of the run
+    maps, each: random test maps and random trajectories of each, 0 for all, instead of the preset's
+    recalls:    those to find thresholds for; figure_maps: maps in predictions.png
+    baselines:  whether the predictors to beat are evaluated as well
+    Raises InputError when the run, its checkpoint or its data set is missing, damaged, or does not fit.
+    """
+    from travjax import dataset
+    from travjax.evaluate import Evaluator
+    from travjax.parallel import Devices
+    from travjax.trained import DATA, load_estimator
+
+    trained, estimator, meta = load_estimator(folder, checkpoint)
+    evaluator = Evaluator.of(trained, dataset.load(data or folder / DATA), Devices.all())
+    name = "evaluation" if checkpoint == "best" else f"evaluation_{checkpoint}"
+    out = output_folder(out or folder / name)
+    sampled = trained.preset.evaluation
+    samples = evaluator.samples(sampled.maps if maps is None else maps, sampled.each if each is None else each)
+    scores = evaluator.scores(_probabilities(evaluator, estimator, samples, "test samples"), samples, recalls)
+    others = _baselines(folder, evaluator, samples, recalls) if baselines else {}
+    description = _description(evaluator, samples, checkpoint, meta["position"])
+    _write_tables(out, scores, others, description, evaluator.paper)
+    _draw(out, evaluator, estimator, scores, others, figure_maps)
+    return scores
+
+
+def _probabilities(evaluator: "Evaluator", estimator: "Estimator", samples: "Samples", what: str) -> np.ndarray:
     with tqdm(desc=what, total=len(samples[0]), unit="sample") as bar:
         return evaluator.probabilities(estimator, samples, bar.update)
 
 
-def _baselines(folder: Path, evaluator, samples, recalls) -> dict:
+def _baselines(
+    folder: Path, evaluator: "Evaluator", samples: "Samples", recalls: Sequence[float]
+) -> dict[str, "Evaluation"]:
     """Evaluations of the predictors to beat: heads on the trunk as it was, and a regression on the ground alone."""
     from travjax.trained import load_estimator
 
@@ -99,13 +146,13 @@ def _baselines(folder: Path, evaluator, samples, recalls) -> dict:
     return {name: evaluator.scores(values, samples, recalls) for name, values in others.items()}
 
 
-def _description(evaluator, samples, arguments: argparse.Namespace, meta: dict) -> dict:
+def _description(evaluator: "Evaluator", samples: "Samples", checkpoint: str, position: dict) -> dict:
     """What was evaluated on what."""
     trained, data = evaluator.run, evaluator.dataset
     return {
-        "checkpoint": arguments.checkpoint,
-        "phase": meta["position"]["phase"],
-        "steps": meta["position"]["total"],
+        "checkpoint": checkpoint,
+        "phase": position["phase"],
+        "steps": position["total"],
         "samples": len(samples[0]),
         "maps": len(np.unique(samples[0])),
         "test_maps": len(data.maps_of("test")),
@@ -114,7 +161,13 @@ def _description(evaluator, samples, arguments: argparse.Namespace, meta: dict) 
     }
 
 
-def _write_tables(out: Path, scores, others: dict, description: dict, paper) -> None:
+def _write_tables(
+    out: Path,
+    scores: "Evaluation",
+    others: Mapping[str, "Evaluation"],
+    description: dict,
+    paper: "Mapping[str, Confusion] | None",
+) -> None:
     from travjax import report
     from travjax.metrics import to_json
 
@@ -139,7 +192,14 @@ def _write_tables(out: Path, scores, others: dict, description: dict, paper) -> 
         print(out / name)
 
 
-def _draw(out: Path, evaluator, estimator, scores, others: dict, maps: int) -> None:
+def _draw(
+    out: Path,
+    evaluator: "Evaluator",
+    estimator: "Estimator",
+    scores: "Evaluation",
+    others: Mapping[str, "Evaluation"],
+    maps: int,
+) -> None:
     from travjax import curves, plots
 
     figure = curves.precision_recall_figure(scores, evaluator.paper, others)
@@ -149,25 +209,22 @@ def _draw(out: Path, evaluator, estimator, scores, others: dict, maps: int) -> N
         print(plots.save(_predictions(evaluator, estimator, maps), out / "predictions.png"))
 
 
-def _predictions(evaluator, estimator, maps: int):
+def _predictions(evaluator: "Evaluator", estimator: "Estimator", maps: int) -> "Figure":
     """Prediction over truth on the whole action space of test maps that fail neither nowhere nor everywhere."""
     from travjax import plots
-    from travjax.labelling import samples as to_show
     from travjax.traverse import unpacked
 
     data, trained = evaluator.dataset, evaluator.run
-    test = data.maps_of("test")
-    failed, known = map(np.asarray, unpacked(data.labels[test]))
-    chosen = to_show({"failed": failed, "known": known, "group": data.group[test]}, maps)
-    trajectories = len(trained.actions)
-    samples = (np.repeat(test[chosen], trajectories), np.tile(np.arange(trajectories), len(chosen)))
-    probability = _probabilities(evaluator, estimator, samples, "maps for the figure").reshape(-1, trajectories, 3)
-    titles = [f"{data.group[index]}, map {index}" for index in test[chosen]]
+    shown = evaluator.to_show(maps)
+    with tqdm(desc="maps for the figure", total=len(shown) * len(trained.actions), unit="sample") as bar:
+        probability = evaluator.whole_maps(estimator, shown, bar.update)
+    failed, known = map(np.asarray, unpacked(data.labels[shown]))
+    titles = [f"{data.group[index]}, map {index}" for index in shown]
     return plots.predicted_maps(
-        data.heights[test[chosen]],
-        probability,
-        failed[chosen],
-        known[chosen],
+        data.heights[shown],
+        {"predicted": probability},
+        failed,
+        known,
         titles,
         trained.robot,
         trained.actions,

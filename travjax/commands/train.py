@@ -3,12 +3,20 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder
+
+if TYPE_CHECKING:
+    from travjax.dataset import Dataset
+    from travjax.parallel import Devices
+    from travjax.preset import Preset
+    from travjax.train import Trainer
+    from travjax.trained import Run
 
 
 def add(commands: options.Commands) -> None:
@@ -20,14 +28,10 @@ def add(commands: options.Commands) -> None:
         "checkpoints, metrics.jsonl, TensorBoard files and a figure in one folder.",
     )
     parser.add_argument("preset", type=Path, metavar="PRESET", help=".toml file, as in experiments/train")
-    parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
-    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
-    options.add_grid(parser)
+    add_run(parser)
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
     )
-    parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
-    parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
     parser.add_argument(
         "--resume", action="store_true", help="go on from the latest checkpoint in --out, if there is one"
     )
@@ -41,9 +45,36 @@ def add(commands: options.Commands) -> None:
     parser.set_defaults(run=run)
 
 
+def add_run(parser: argparse._ActionsContainer) -> None:
+    """What of a run may differ from its preset; see `run_of`."""
+    parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
+    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    options.add_grid(parser)
+    parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
+
+
+def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
+    """The run of a preset with what `add_run` lets differ from it."""
+    from travjax.trained import Run
+
+    if arguments.weights:
+        preset = replace(preset, weights=arguments.weights)
+    if arguments.seed is not None:
+        seed = options.seed(arguments)
+        preset = replace(
+            preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
+        )
+    preset = replace(preset, robot=arguments.robot or preset.robot)
+    named = argparse.Namespace(**vars(arguments) | {"robot": preset.robot})
+    grid, robot, actions = options.configuration(named)
+    return Run(preset, robot, actions, grid)
+
+
 def run(arguments: argparse.Namespace) -> None:
     """Trains."""
     from travjax.parallel import Devices, join
+    from travjax.preset import Preset
 
     shared = (arguments.coordinator, arguments.processes, arguments.process)
     if any(value is not None for value in shared):
@@ -51,24 +82,44 @@ def run(arguments: argparse.Namespace) -> None:
         require(given, "--coordinator, --processes, --process", shared, "all three or none")
         join(*shared)
     devices = Devices.all()
-    folder, wanted = _folder(arguments), _wanted(arguments)
-    _check_folder(folder, wanted, arguments.resume)
-    devices.wait()
-    _train(arguments, wanted, folder, devices)
+    wanted = run_of(Preset.load(arguments.preset), arguments)
+    folder, data = arguments.out or Path("runs/train") / arguments.preset.stem, arguments.data
+    train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
+    if devices.main:
+        print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")
 
 
-def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None:
+def train(
+    wanted: "Run",
+    folder: Path,
+    devices: "Devices",
+    data: Path | None = None,
+    resume: bool = False,
+    option: str = "--out",
+) -> None:
+    """Trains a run in a folder, and says what it writes there.
+
+    data:   folder of its data set, instead of one made by the preset
+    resume: goes on with the run that the folder holds, if it holds one
+    option: what a message calls a folder that holds another run
+    Raises InputError before it trains: the folder holds a run that differs or is not to be gone on with, first weights
+    or data set are missing or damaged or do not fit.
+    """
     from travjax.estimator import create
     from travjax.imagenet import load_weights
     from travjax.preset import find_weights
     from travjax.train import Trainer
+    from travjax.trained import has_checkpoints
 
     preset = wanted.preset
-    resumes = arguments.resume and _has_checkpoints(folder)
+    resumes = has_checkpoints(folder)
+    if resumes:
+        _check_folder(folder, wanted, resume, option)
+    devices.wait()
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
     estimator = None if resumes else create(preset.trunk, preset.heads, preset.training.seed, weights)
-    trainer = Trainer(wanted, _dataset(arguments, wanted, folder, devices), folder, devices)
+    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices)
     output_folder(folder)
     if devices.main:
         wanted.save(folder)
@@ -81,68 +132,39 @@ def _train(arguments: argparse.Namespace, wanted, folder: Path, devices) -> None
             print(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:
-        _finish(folder, arguments.data)
+        _finish(folder)
 
 
-def _wanted(arguments: argparse.Namespace):
-    """The run that is asked for."""
-    from travjax.preset import Preset
-    from travjax.trained import Run
-
-    preset = Preset.load(arguments.preset)
-    if arguments.weights:
-        preset = replace(preset, weights=arguments.weights)
-    if arguments.seed is not None:
-        seed = options.seed(arguments)
-        preset = replace(
-            preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
-        )
-    arguments.robot = arguments.robot or preset.robot
-    grid, robot, actions = options.configuration(arguments)
-    return Run(replace(preset, robot=arguments.robot), robot, actions, grid)
-
-
-def _folder(arguments: argparse.Namespace) -> Path:
-    return arguments.out or Path("runs/train") / arguments.preset.stem
-
-
-def _check_folder(folder: Path, wanted, resume: bool) -> None:
+def _check_folder(folder: Path, wanted: "Run", resume: bool, option: str) -> None:
     """A run is neither overwritten nor continued with other settings."""
     from travjax.trained import Run
 
-    if not _has_checkpoints(folder):
-        return
     if not resume:
         raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
-    Run.load(folder).require_same(wanted, f"--resume {folder}")
+    Run.load(folder).require_same(wanted, f"{option} {folder}")
 
 
-def _has_checkpoints(folder: Path) -> bool:
-    checkpoints = folder / "checkpoints"
-    return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
-
-
-def _dataset(arguments: argparse.Namespace, wanted, folder: Path, devices):
+def _dataset(data: Path | None, wanted: "Run", folder: Path, devices: "Devices") -> "Dataset":
     """The data set that is given, else the run's own, made if it is not there yet."""
     from travjax import dataset
     from travjax.commands.dataset import made
     from travjax.trained import DATA
 
-    if arguments.data:
-        return dataset.load(arguments.data)
-    kept = folder / DATA
-    for split, size in zip(dataset.SPLITS[:2], wanted.preset.dataset.split_sizes()[:2], strict=True):
-        require(size > 0, f"[dataset] of {arguments.preset}: {split} maps", size, "at least 1: more maps, other shares")
+    if data:
+        return dataset.load(data)
+    kept, config = folder / DATA, wanted.preset.dataset
+    for split, size in zip(dataset.SPLITS[:2], config.split_sizes()[:2], strict=True):
+        require(size > 0, f"the preset's [dataset]: {split} maps", size, "at least 1: more maps, other shares")
     if devices.main and not (kept / "dataset.json").exists():
-        made(wanted.preset.dataset, wanted.robot, wanted.actions, wanted.grid, kept)
+        made(config, wanted.robot, wanted.actions, wanted.grid, kept)
     devices.wait()
-    loaded, config = dataset.load(kept), wanted.preset.dataset
+    loaded = dataset.load(kept)
     made_anew = "remove it to have it made anew, or take another --out"
     require(loaded.config == config, f"data set {kept}", loaded.config, f"made from {config}; {made_anew}")
     return loaded
 
 
-def _draw_inputs(trainer, folder: Path) -> Path:
+def _draw_inputs(trainer: "Trainer", folder: Path) -> Path:
     """The three channels of a few training samples."""
     import numpy as np
 
@@ -160,7 +182,7 @@ def _draw_inputs(trainer, folder: Path) -> Path:
     return plots.save(curves.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png")
 
 
-def _finish(folder: Path, data: Path | None) -> None:
+def _finish(folder: Path) -> None:
     """The figure of the run, and where everything is."""
     from travjax import curves, plots
     from travjax.runlog import read_rows
@@ -170,4 +192,3 @@ def _finish(folder: Path, data: Path | None) -> None:
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         print(path)
     print(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))
-    print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")

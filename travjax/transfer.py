@@ -1,0 +1,193 @@
+"""The transfer experiment: what pre-training is worth on real maps (SPEC section 11, the second half of the paper).
+
+Runs that differ in their first weights alone, the arms, train on the same samples of real maps with the same settings,
+and are scored after every epoch on held-out ground. With `head_epochs` the trunks stay frozen and each one's features
+are computed once for all seeds; with `epochs` everything is trained, as in the paper.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from flax import nnx
+
+from travjax.checkpoint import load_meta
+from travjax.config import InputError, require
+from travjax.dataset import Dataset, require_same
+from travjax.estimator import Estimator, Heads, create
+from travjax.files import output_folder, save_npz
+from travjax.imagenet import load_weights
+from travjax.parallel import Devices
+from travjax.preset import TrainingConfig, find_weights
+from travjax.runlog import read_rows
+from travjax.sampling import Samples, natural_sample
+from travjax.train import Trainer
+from travjax.trained import Run, has_checkpoints, load_estimator
+
+ARMS = ("random", "ImageNet", "ImageNet + synthetic")
+"""What the runs begin with, in the paper's order."""
+
+SCRATCH, IMAGENET, SYNTHETIC = ARMS
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """The experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
+
+    sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
+    synthetic:  preset that trains the synthetic model
+    seeds:      of the runs of each arm: order, dropout, first weights that are random
+    each:       random known trajectories of each held-out window that are scored, 0 for all
+    shown:      held-out site in the figure of maps; its licence must allow that
+    shown_maps: number of its windows there
+    training:   `head_epochs` for frozen trunks or `epochs` for all of it, not both
+
+    Files are named from the folder of the preset. Raises InputError that names field, value and what is allowed.
+    """
+
+    sites: str = "sites.toml"
+    synthetic: str = "../train/laptop.toml"
+    seeds: tuple[int, ...] = (0, 1, 2)
+    each: int = 200
+    shown: str = "mars_live_site"
+    shown_maps: int = 2
+    training: TrainingConfig = TrainingConfig()
+
+    def __post_init__(self):
+        for name in ("sites", "synthetic", "shown"):
+            require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
+        for name in ("each", "shown_maps"):
+            value = getattr(self, name)
+            require(type(value) is int and value >= 0, name, value, "a whole number, at least 0")
+        whole = bool(self.seeds) and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
+        allowed = "different whole numbers from 0, at least one"
+        require(whole and len(set(self.seeds)) == len(self.seeds), "seeds", self.seeds, allowed)
+        both = self.training.head_epochs and self.training.epochs
+        require(not both, "[training] head_epochs", self.training.head_epochs, "0 where epochs is not, or the reverse")
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the trunks are."""
+        return self.training.head_epochs > 0
+
+    @property
+    def epochs(self) -> int:
+        """Of each run."""
+        return self.training.head_epochs or self.training.epochs
+
+
+class Transfer:
+    """The runs of all arms, in a folder.
+
+    base:      the synthetic model's run; synthetic: its folder, which is read when its arm begins
+    held_out:  samples of the test maps of each site, at natural frequency
+    Raises InputError when the data set is not for the run's robot, action space and grid, when it has no held-out site
+    or not the one to be shown, and when the ImageNet weights are missing.
+    """
+
+    def __init__(
+        self, config: TransferConfig, base: Run, synthetic: Path, dataset: Dataset, folder: Path, devices: Devices
+    ):
+        self.config, self.base, self.synthetic, self.dataset = config, base, synthetic, dataset
+        self.folder, self.devices = folder, devices
+        require_same(dataset, base.robot, base.actions, base.grid)
+        self.held_out = _held_out(dataset, config)
+        if config.shown_maps:
+            allowed = f"a held-out site, {', '.join(self.held_out)}, or shown_maps 0"
+            require(config.shown in self.held_out, "shown", config.shown, allowed)
+        find_weights(base.preset.weights)
+
+    def run_of(self, arm: str, seed: int) -> Run:
+        """What a run is made from: the synthetic model's settings, trained as the experiment says."""
+        preset = self.base.preset
+        weights = {SCRATCH: "none", IMAGENET: preset.weights, SYNTHETIC: f"{self.synthetic}"}[arm]
+        training = replace(self.config.training, seed=seed, subset_seed=self.config.training.drawn_by)
+        return replace(self.base, preset=replace(preset, weights=weights, training=training))
+
+    def place_of(self, arm: str, seed: int) -> Path:
+        """The folder of a run, which is one of `travjax train`."""
+        return self.folder / "runs" / f"{_name(arm)}_{seed}"
+
+    def rows(self, arm: str, seed: int) -> list[dict]:
+        """A row for the first state and for each epoch of a run, which is trained as far as it is not yet."""
+        place = self.place_of(arm, seed)
+        if not self._is_finished(place):
+            self._train(arm, seed, place)
+        return [row for row in read_rows(place / "metrics.jsonl") if "watched" in row]
+
+    def estimator(self, arm: str, seed: int) -> Estimator:
+        """Of the epoch that is best on the validation windows."""
+        return load_estimator(self.place_of(arm, seed), "best")[1]
+
+    @cached_property
+    def pretrained(self) -> Estimator:
+        """The synthetic model, untouched."""
+        return load_estimator(self.synthetic, "best")[1]
+
+    def _is_finished(self, place: Path) -> bool:
+        try:
+            position = load_meta(place / "checkpoints")["position"]
+        except InputError:
+            return False
+        return position["epoch"] == self.config.epochs
+
+    def _train(self, arm: str, seed: int, place: Path) -> None:
+        run = self.run_of(arm, seed)
+        trainer = Trainer(run, self.dataset, output_folder(place), self.devices, watched=self.held_out)
+        if self.devices.main:
+            run.save(place)
+        if has_checkpoints(place):
+            trainer.resume()
+        else:
+            trainer.start(self._first(arm, seed))
+        if self.config.frozen:
+            self._share_features(trainer, arm)
+        trainer.train()
+
+    def _first(self, arm: str, seed: int) -> Estimator:
+        """Where a run begins; random trunks differ by seed unless they stay as they are."""
+        preset = self.base.preset
+        if arm == SYNTHETIC:
+            return self.pretrained
+        file = find_weights(preset.weights) if arm == IMAGENET else None
+        weights = load_weights(file, preset.trunk) if file else None
+        trunk_seed = self.config.seeds[0] if self.config.frozen else seed
+        made = create(preset.trunk, preset.heads, trunk_seed, weights)
+        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(seed + 1)))
+
+    def _share_features(self, trainer: Trainer, arm: str) -> None:
+        """The features of a frozen trunk, kept in a file for its other seeds and for a run that goes on."""
+        path, fingerprint = self.folder / "features" / f"{_name(arm)}.npz", self.dataset.fingerprint
+        if path.exists():
+            with np.load(path) as file:
+                kept = dict(file)
+            if str(kept.pop("dataset")) == fingerprint:
+                trainer.features = kept
+                return
+        save_npz(output_folder(path.parent) / path.name, dataset=fingerprint, **trainer.features)
+
+
+def _name(arm: str) -> str:
+    return arm.lower().replace(" + ", "_")
+
+
+def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
+    """Samples of the test maps of each site."""
+    test = dataset.maps_of("test")
+    require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
+    sites = list(dict.fromkeys(dataset.group[test].tolist()))
+    each, seed = config.each or len(dataset.actions), config.training.drawn_by
+    of = lambda site: natural_sample(dataset.labels, test[dataset.group[test] == site], seed, len(test), each)
+    return {site: of(site) for site in sites}
+
+
+def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
+    """The rows of all runs by arm and seed, those of one seed after the other; on_run is told which one begins."""
+    results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in ARMS}
+    for arm in ARMS:
+        for seed in transfer.config.seeds:
+            on_run(arm, seed)
+            results[arm][seed] = transfer.rows(arm, seed)
+    return results
