@@ -48,6 +48,16 @@ def machine() -> str:
     return f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
 
 
+def processor() -> str:
+    """The name of the processor, or its kind where the system does not tell."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return next(iter(named), "") or platform.processor() or platform.machine()
+
+
 def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
     """Raises InputError when the sequential simulator refuses robot, actions and grid; `node_table` does so earlier."""
     try:
@@ -64,18 +74,30 @@ def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) ->
         make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
         yield _timed("terrain", maps, make, repeats, 0)
     for maps in BATCHES:
-        heights = generate_terrain(*_mixture(0, maps), grid=grid)
-        heights = heights[0] if maps == 1 else heights
-        run = lambda heights=heights: simulate(heights, robot, actions, grid=grid)
-        yield _timed("labelling", maps, run, repeats, len(actions))
+        yield labelling_row(maps, robot, actions, grid, repeats)
 
 
-def reference_row(robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
-    """One whole map by the sequential simulator, one trajectory after the other."""
+def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
+    """Labelling of so many maps at once, on compiled code."""
+    heights = generate_terrain(*_mixture(0, maps), grid=grid)
+    heights = heights[0] if maps == 1 else heights
+    return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
+
+
+def reference_row(
+    robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
+) -> dict:
+    """One whole map by the sequential simulator, one trajectory after the other.
+
+    on_progress: is told how many trajectories of a call are done
+    """
     heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
-    start = time.perf_counter()
-    reference.simulate(heights, robot, actions, cell_size=grid.spacing, on_progress=on_progress)
-    return _row(SEQUENTIAL, 1, time.perf_counter() - start, len(actions), None, 1)
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        reference.simulate(heights, robot, actions, cell_size=grid.spacing, on_progress=on_progress)
+        seconds.append(time.perf_counter() - start)
+    return _row(SEQUENTIAL, 1, statistics.median(seconds), len(actions), None, repeats)
 
 
 def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
@@ -113,8 +135,11 @@ def with_speed_up(rows: list[dict]) -> list[dict]:
 
 
 def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
-    """One line for each row, the keys in `columns` and `machine` as header."""
-    cells = [[*("" if row[key] is None else str(row[key]) for key in columns), machine()] for row in rows]
+    """One line for each row, the keys in `columns` and `machine` as header: this one, unless a row names its own."""
+    here = machine()
+    cells = [
+        [*("" if row[key] is None else str(row[key]) for key in columns), row.get("machine", here)] for row in rows
+    ]
     path.write_text("\n".join("\t".join(line) for line in [[*columns, "machine"], *cells]) + "\n")
 
 

@@ -111,13 +111,13 @@ class Bench:
         """The same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
         return self._timed(TORCH, STEP_BATCH, _torch_training(self.dataset.grid))
 
-    def all_trajectories(self) -> dict:
-        """All trajectories of one map through the network."""
+    def all_trajectories(self, batch: int = BATCH, repeats: int = 1) -> dict:
+        """All trajectories of one map through the network, so many at once."""
         count = len(self.dataset.actions)
         samples = (np.zeros(count, np.int32), np.arange(count, dtype=np.int32))
         variables = self.devices.replicate({name: self.variables[name] for name in VARIABLES})
-        run = lambda: over_samples(sample_logits, self.graph, variables, self.source, samples, self.devices, BATCH)
-        return self._timed(f"all {count} trajectories of a map through the network", count, run, repeats=1)
+        run = lambda: over_samples(sample_logits, self.graph, variables, self.source, samples, self.devices, batch)
+        return self._timed(f"all {count} trajectories of a map through the network", count, run, repeats)
 
     def _timed(self, what: str, batch: int, run: Callable[[], object], repeats: int | None = None) -> dict:
         seconds = []

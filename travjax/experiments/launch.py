@@ -1,0 +1,67 @@
+"""What the experiments share: how they start, where their presets are, and the report that they end with."""
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from travjax.config import InputError
+from travjax.entry import Parser, guarded, use_compilation_cache
+from travjax.files import written_whole
+
+Piece = str | Path
+"""Of a report: text, or a figure."""
+
+
+def parser(name: str, description: str) -> Parser:
+    """An empty parser for `python -m travjax.experiments.NAME`."""
+    return Parser(prog=f"python -m travjax.experiments.{name}", description=description)
+
+
+def launch(
+    options: argparse.ArgumentParser, run: Callable[[argparse.Namespace], object], argv: Sequence[str] | None = None
+) -> int:
+    """Parses the words and runs the experiment; returns the exit code, 2 for bad input, which is said in one line."""
+
+    def work() -> None:
+        arguments = options.parse_args(argv)
+        use_compilation_cache()
+        run(arguments)
+
+    return guarded(work)
+
+
+def find_preset(given: str, experiment: str) -> Path:
+    """The file of a preset: `given` is a path, or a name such as "laptop" for experiments/EXPERIMENT/laptop.toml here.
+
+    Raises InputError that lists the names when there is no such file.
+    """
+    if Path(given).suffix == ".toml":
+        if Path(given).is_file():
+            return Path(given)
+        raise InputError(f"preset {given}: no such file")
+    folder = Path("experiments") / experiment
+    path = folder / f"{given}.toml"
+    if path.is_file():
+        return path
+    names = ", ".join(sorted(found.stem for found in folder.glob("*.toml") if found.is_file()))
+    elsewhere = f"a .toml file, or a name in a folder where {folder} holds presets"
+    allowed = f"{names}, or a .toml file" if names else elsewhere
+    raise InputError(f"preset {given}: no {path} here; allowed: {allowed}")
+
+
+def write_report(folder: Path, title: str, pieces: Sequence[Piece]) -> Path:
+    """Writes report.md: Markdown text, and figures of the folder, which are named after their files."""
+    shown = [piece if isinstance(piece, str) else _figure(piece.relative_to(folder)) for piece in pieces]
+    path = folder / "report.md"
+    with written_whole(path) as temporary:
+        temporary.write_text("\n\n".join([f"# {title}", *shown]) + "\n")
+    return path
+
+
+def _figure(path: Path) -> str:
+    return f"![{path.stem.replace('_', ' ').capitalize()}]({path.as_posix()})"
+
+
+def verbatim(text: str, language: str = "") -> str:
+    """Text as it stands, for a report."""
+    return f"```{language}\n{text}\n```"

@@ -1,0 +1,98 @@
+"""`python -m travjax.experiments.synthetic`: the estimator on synthetic maps, the first half of the paper.
+
+Trains at a preset of experiments/train and evaluates on the test maps: the paper's first table beside ours, figures,
+and a report. The recorded runs are under experiments/synthetic.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from travjax.bench import machine
+from travjax.commands import train
+from travjax.commands.evaluate import evaluate
+from travjax.experiments import launch
+from travjax.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
+from travjax.parallel import Devices
+from travjax.preset import Preset
+from travjax.runlog import read_rows
+from travjax.trained import Run
+from travjax.traverse import as_in_paper
+
+DESCRIPTION = (
+    "Makes synthetic maps, trains the estimator on them and evaluates it on maps that it has not seen: the first half "
+    "of the paper. A run that was interrupted goes on."
+)
+
+EVALUATION = ("predictions", "precision_recall", "reliability")
+TRAINING = ("training", "inputs")
+"""Figures in the order of the report."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the experiment; returns the exit code, 2 for bad input."""
+    options = launch.parser("synthetic", DESCRIPTION)
+    options.add_argument(
+        "preset",
+        nargs="?",
+        default="laptop",
+        metavar="PRESET",
+        help="smoke, laptop or paper of experiments/train, or a .toml file (laptop)",
+    )
+    train.add_run(options)
+    options.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write to (runs/synthetic/ and the preset's name)"
+    )
+    return launch.launch(options, run, argv)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Trains as far as that is not done yet, evaluates, and writes the report."""
+    path = launch.find_preset(arguments.preset, "train")
+    wanted = train.run_of(Preset.load(path), arguments)
+    folder = arguments.out or Path("runs/synthetic") / path.stem
+    train.train(wanted, folder, Devices.all(), resume=True)
+    scores = evaluate(folder, out=folder / "evaluation")
+    print(launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder)))
+
+
+def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:
+    """Of the report."""
+    last = read_rows(folder / "metrics.jsonl")[-1]
+    trained = (
+        f"{wanted.robot.name}, {len(wanted.actions)} trajectories a map; {wanted.preset.dataset.maps:,} maps; "
+        f"{last['step']:,} steps, {last['samples_per_s']:,.0f} samples/s in the last epoch on {machine()}."
+    )
+    places = [folder / "evaluation" / f"{name}.png" for name in EVALUATION]
+    places += [folder / f"{name}.png" for name in TRAINING]
+    figures = [path for path in places if path.exists()]
+    return [
+        trained,
+        *_beside_the_paper(wanted, scores.scores[OVERALL].confusion),
+        "## Tables",
+        launch.verbatim((folder / "evaluation" / "tables.txt").read_text().strip()),
+        "## Figures",
+        *figures,
+        "## Configuration",
+        launch.verbatim((folder / "run.json").read_text().strip(), "json"),
+    ]
+
+
+def _beside_the_paper(wanted: Run, ours: Confusion) -> list[str]:
+    """One line over all events, if robot and action space are the paper's."""
+    if not as_in_paper(wanted.robot, wanted.actions):
+        return []
+    shown = lambda value: "-" if math.isnan(value) else f"{value:.3f}"
+    paper = PAPER_SYNTHETIC[OVERALL]
+    pairs = {
+        "recall": (ours.recall, paper.recall),
+        "precision": (ours.precision, paper.precision),
+        "F1": (ours.f1, paper.f1),
+    }
+    figures = ", ".join(f"{name} {shown(one)} ({shown(other)})" for name, (one, other) in pairs.items())
+    return [f"Over the three events, the paper's in brackets: {figures}. Its maps and robot are not published in full."]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

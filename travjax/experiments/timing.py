@@ -1,0 +1,157 @@
+"""`python -m travjax.experiments.timing`: how long all trajectories of a map take, by simulator and by network.
+
+The sequential simulator, the batched one and the network on the device at hand, in one run, beside what the paper took.
+The recorded runs are under experiments/timing.
+"""
+
+import argparse
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import jax
+from tqdm import tqdm
+
+from travjax import bench, plots
+from travjax.actions import ActionSpace
+from travjax.bench_network import BATCH, Bench
+from travjax.commands import options
+from travjax.config import require
+from travjax.experiments import launch
+from travjax.files import output_folder, written_whole
+from travjax.grid import Grid
+from travjax.parallel import Devices
+from travjax.preset import Preset
+from travjax.report import rows_table
+from travjax.resnet import ResNetConfig
+from travjax.robot import Robot
+
+COLUMNS = {
+    "what": "what",
+    "device": "device",
+    "seconds": "s a map",
+    "trajectories_per_s": "trajectories/s",
+    "speed_up": "x sequential",
+    "repeats": "repeats",
+}
+
+TOGETHER = 32
+"""Maps at once, where it is more than one."""
+
+SEQUENTIAL, NETWORK = "sequential simulator", "network"
+PAPER = {f"paper: {SEQUENTIAL}": ("Intel i5-6500", 58.0), f"paper: {NETWORK}": ("NVIDIA GTX 1050", 17.0)}
+"""Devices and seconds for the 3042 trajectories of one map (SPEC section 10)."""
+
+DESCRIPTION = (
+    "Measures how long all trajectories of a map take by the sequential simulator, by the batched one and by the "
+    "network, beside the paper's figures."
+)
+
+MEANING = (
+    "Medians of repeated calls after one that compiles; a call ends when its result is there. The network's time holds "
+    "the making of its inputs; its weights are random, which makes no difference. The sequential simulator takes one "
+    "trajectory after the other in NumPy, as the paper's does; *x sequential* is against it, for the paper's figures "
+    "against the paper's own."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the experiment; returns the exit code, 2 for bad input."""
+    parser = launch.parser("timing", DESCRIPTION)
+    options.add_robot(parser)
+    options.add_grid(parser)
+    parser.add_argument(
+        "--network",
+        metavar="PRESET",
+        help="preset of experiments/train, or a .toml file, whose network is measured (a ResNet50 in float32)",
+    )
+    parser.add_argument(
+        "--batch", type=int, default=BATCH, metavar="N", help=f"samples in the network at once ({BATCH})"
+    )
+    parser.add_argument(
+        "--repeats", type=int, default=5, metavar="N", help="timed calls of which the median is taken (5)"
+    )
+    options.add_out(parser, "runs/timing")
+    return launch.launch(parser, run, argv)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Measures, and writes the table, a figure and the report."""
+    grid, robot, actions = options.configuration(arguments)
+    require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
+    require(arguments.batch > 0, "--batch", arguments.batch, "at least 1")
+    Devices.all().check_batch(arguments.batch)
+    bench.check(robot, actions, grid)
+    trunk = ResNetConfig()
+    if arguments.network:
+        trunk = Preset.load(launch.find_preset(arguments.network, "train")).trunk
+    out = output_folder(arguments.out)
+    rows = _of_paper() if actions == ActionSpace() else []
+    rows += measured(robot, actions, grid, trunk, arguments.batch, arguments.repeats)
+    _write(rows, f"{robot.name}, {len(actions)} trajectories of a map; {bench.machine()}", out)
+
+
+def measured(
+    robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
+) -> list[dict]:
+    """A row for each way to all trajectories of a map, on the device at hand, with progress bars."""
+    with tqdm(desc=SEQUENTIAL, total=repeats * len(actions), unit="trajectory") as bar:
+        row = bench.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
+    sequential = row["ms_per_map"] / 1e3
+    rows = [_row(SEQUENTIAL, f"{bench.processor()}, one core", sequential, len(actions), sequential, repeats)]
+
+    def others() -> Iterator[dict]:
+        device = _device()
+        for maps in (1, TOGETHER):
+            row = bench.labelling_row(maps, robot, actions, grid, repeats)
+            what = f"batched simulator, {maps} map{'s at once' if maps > 1 else ''}"
+            yield _row(what, device, row["ms_per_map"] / 1e3, len(actions), sequential, repeats)
+        row = Bench(robot, actions, grid, repeats, trunk).all_trajectories(batch, repeats)
+        what = f"{NETWORK}, {trunk.dtype}, batches of {batch}"
+        yield _row(what, device, row["ms"] / 1e3, len(actions), sequential, repeats)
+
+    return rows + list(tqdm(others(), "batched simulator, network", total=3))
+
+
+def _of_paper() -> list[dict]:
+    """What the paper says."""
+    sequential = next(seconds for _, seconds in PAPER.values())
+    trajectories = len(ActionSpace())
+    return [
+        _row(what, device, seconds, trajectories, sequential, None) | {"machine": f"the paper's, {device}"}
+        for what, (device, seconds) in PAPER.items()
+    ]
+
+
+def _row(what: str, device: str, seconds: float, trajectories: int, sequential: float, repeats: int | None) -> dict:
+    return {
+        "what": what,
+        "device": device,
+        "seconds": seconds,
+        "trajectories_per_s": trajectories / seconds,
+        "speed_up": sequential / seconds,
+        "repeats": repeats,
+    }
+
+
+def _device() -> str:
+    """What JAX runs on."""
+    devices = jax.devices()
+    if devices[0].platform == "cpu":
+        return f"{bench.processor()}, {os.cpu_count()} cores"
+    return devices[0].device_kind if len(devices) == 1 else f"{len(devices)} x {devices[0].device_kind}"
+
+
+def _write(rows: list[dict], headline: str, out: Path) -> None:
+    """Prints the table, and writes it as TSV, a figure and the report."""
+    table = rows_table(rows, COLUMNS)
+    print(f"\n{headline}\n{table}\n")
+    with written_whole(out / "timing.tsv") as temporary:
+        bench.write_tsv(rows, temporary, COLUMNS)
+    figure = plots.save(plots.timing_figure(rows), out / "timing.png")
+    pieces: list[launch.Piece] = [f"{headline}.", launch.verbatim(table), MEANING, figure]
+    print(out / "timing.tsv", figure, launch.write_report(out, "All trajectories of a map", pieces), sep="\n")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

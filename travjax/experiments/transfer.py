@@ -1,0 +1,214 @@
+"""`python -m travjax.experiments.transfer`: what pre-training on synthetic maps is worth on real ones.
+
+Trains every arm of transfer.py and writes tables, figures, a report and all numbers as JSON. The recorded run is under
+experiments/transfer.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from travjax.commands import evaluate, train
+from travjax.config import InputError, load_toml, require, to_json
+from travjax.experiments import launch
+from travjax.files import output_folder, written_whole
+
+DESCRIPTION = (
+    "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "
+    "epoch on held-out sites: the second half of the paper. A run that was interrupted goes on."
+)
+
+COLOURS = {"random": "tab:gray", "ImageNet": "tab:blue", "ImageNet + synthetic": "tab:red"}
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """Adds the options."""
+    parser.add_argument(
+        "preset",
+        nargs="?",
+        default="laptop",
+        metavar="PRESET",
+        help="smoke, laptop or paper of experiments/transfer, or a .toml file (laptop)",
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="data set of real maps, instead of that of the sites")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to write to (runs/transfer/ and the preset's name)"
+    )
+    parser.add_argument(
+        "--synthetic", type=Path, metavar="RUN", help="folder of a training run on synthetic maps, instead of a new one"
+    )
+    synthetic = parser.add_argument_group("the synthetic model, unless a folder of it is given")
+    train.add_run(synthetic)
+    parser.set_defaults(of_synthetic={action.dest: action.default for action in synthetic._group_actions})
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Trains what is not trained yet, and writes the results."""
+    from travjax.parallel import Devices
+    from travjax.transfer import Transfer, TransferConfig, run_all
+    from travjax.transfer_scores import Results
+
+    path = launch.find_preset(arguments.preset, "transfer")
+    config, devices = load_toml(path, TransferConfig), Devices.all()
+    out = output_folder(arguments.out or Path("runs/transfer") / path.stem)
+    _require_same(out, config)
+    base = _base(path.parent / config.synthetic, arguments)
+    synthetic = arguments.synthetic or out / "synthetic"
+    data = _data(path.parent / config.sites, arguments.data, base, out)
+    transfer = Transfer(config, base, synthetic, data, out, devices)  # refuses what does not fit before hours of work
+    if not arguments.synthetic:
+        _train_synthetic(base, synthetic, devices)
+    say = lambda arm, seed: tqdm.write(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
+    _write(transfer, Results.of(run_all(transfer, say)), out)
+
+
+def _require_same(out: Path, config) -> None:
+    """Keeps the configuration in the folder, and refuses a folder with another one."""
+    path = out / "config.json"
+    text = json.dumps(to_json(config), indent=1) + "\n"
+    if path.exists() and path.read_text() != text:
+        raise InputError(
+            f"--out {out}: holds an experiment of another preset; allowed: another folder, or the same preset"
+        )
+    with written_whole(path) as temporary:
+        temporary.write_text(text)
+
+
+def _base(preset: Path, arguments: argparse.Namespace):
+    """The run of the synthetic model: that of the folder given, else that of the experiment."""
+    from travjax.preset import Preset
+    from travjax.trained import Run
+
+    if not arguments.synthetic:
+        return train.run_of(Preset.load(preset), arguments)
+    for name, default in arguments.of_synthetic.items():
+        given = getattr(arguments, name)
+        require(given == default, f"--{name}", given, "left out where --synthetic is given")
+    return Run.load(arguments.synthetic)
+
+
+def _train_synthetic(base, folder: Path, devices) -> None:
+    """Trains and evaluates the synthetic model as far as that is not done."""
+    train.train(base, folder, devices, resume=True)
+    if not (folder / TABLES).exists():
+        evaluate.evaluate(folder)
+
+
+TABLES = "evaluation/tables.txt"
+"""Tables of `travjax evaluate` in the folder of a training run."""
+
+
+def _data(sites: Path, given: Path | None, base, out: Path):
+    """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
+    from travjax import dataset
+    from travjax.trained import DATA
+
+    if given:
+        return dataset.load(given)
+    if (out / DATA / "dataset.json").exists():
+        return dataset.load(out / DATA)
+    from travjax.commands.dataset import made_of_sites
+    from travjax.provenance import SitesConfig
+
+    return made_of_sites(SitesConfig.load(sites), base.robot, base.actions, base.grid, out / DATA)
+
+
+def _write(transfer, results, out: Path) -> None:
+    """Tables, figures, JSON and the report."""
+    from travjax import curves, plots
+    from travjax.bench import machine
+    from travjax.statistics import statistics_table
+    from travjax.transfer import SYNTHETIC
+    from travjax.transfer_scores import arms_table, events_table, results_json
+
+    config, base = transfer.config, transfer.base
+    trained = "the heads, on frozen trunks," if config.frozen else "everything"
+    tables = {
+        "First weights": arms_table(results),
+        f"Events, {SYNTHETIC}": events_table(results, SYNTHETIC),
+        "Real maps": statistics_table(transfer.dataset, as_in_paper=False),
+    }
+    for title, table in tables.items():
+        print(f"\n{title}\n{table}")
+    print()
+    figures = [plots.save(curves.transfer_figure(results, COLOURS), out / "f1.png")]
+    if config.shown_maps:
+        figures.append(plots.save(_maps_figure(transfer), out / "maps.png"))
+    described: dict[str, Any] = {
+        "config": to_json(config),
+        "synthetic": to_json(base.preset),
+        "robot": to_json(base.robot),
+    }
+    provenance = transfer.dataset.provenance
+    described |= {"machine": machine(), "real": provenance and provenance.to_json()}
+    with written_whole(out / "results.json") as temporary:
+        temporary.write_text(json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
+    intro = (
+        f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_count(transfer):,} samples "
+        f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
+    )
+    synthetic = transfer.synthetic / TABLES
+    sections = {"Synthetic test maps": synthetic.read_text().strip()} if synthetic.exists() else {}
+    sections |= tables
+    pieces: list[launch.Piece] = [
+        intro,
+        *(f"## {title}\n\n{launch.verbatim(table)}" for title, table in sections.items()),
+        *figures,
+    ]
+    report = launch.write_report(out, "Transfer to real maps", pieces)
+    print(report, out / "results.json", *figures, sep="\n")
+
+
+MEANING = (
+    "Scores are those of held-out windows at natural frequency, at a threshold of 0.5; figures of several seeds are "
+    "means ± standard deviations. *Always fails* is the predictor that says so of every trajectory; *of the way to 1* "
+    "is the share of the distance from its F1 to 1 that an arm covers. The best epoch is the best one on the held-out "
+    "site itself, as in the paper; validation's epoch is chosen on other windows. The paper's figures are those of its "
+    "own site and robot."
+)
+
+
+def _count(transfer) -> int:
+    """Training samples of an epoch."""
+    from travjax.training_data import TrainingData
+
+    return TrainingData(transfer.dataset, transfer.config.training).count(2, 0)
+
+
+def _maps_figure(transfer):
+    """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
+    from travjax import plots
+    from travjax.evaluate import Evaluator
+    from travjax.transfer import SYNTHETIC
+    from travjax.traverse import unpacked
+
+    config, data, base = transfer.config, transfer.dataset, transfer.base
+    evaluator = Evaluator.of(base, data, transfer.devices)
+    shown = evaluator.to_show(config.shown_maps, config.shown)
+    models = {"before": transfer.pretrained, "after": transfer.estimator(SYNTHETIC, config.seeds[0])}
+    predictions = {}
+    for name, estimator in models.items():
+        with tqdm(desc=f"maps for the figure, {name}", total=len(shown) * len(base.actions), unit="sample") as bar:
+            predictions[name] = evaluator.whole_maps(estimator, shown, bar.update)
+    failed, known = map(np.asarray, unpacked(data.labels[shown]))
+    places = data.provenance.origin[shown] if data.provenance else shown
+    titles = [f"{config.shown}, SW {np.round(place, 1).tolist()}" for place in places]
+    return plots.predicted_maps(
+        data.heights[shown], predictions, failed, known, titles, base.robot, base.actions, base.grid
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the experiment; returns the exit code, 2 for bad input."""
+    parser = launch.parser("transfer", DESCRIPTION)
+    add(parser)
+    return launch.launch(parser, run, argv)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
