@@ -224,3 +224,15 @@ def test_settings_that_cannot_be_are_refused_by_name(settings, field):
     with pytest.raises(InputError) as raised:
         TransferConfig(**{"training": FROZEN.training} | settings)
     assert str(raised.value).startswith(f"{field} = ")
+
+
+def test_figures_of_another_data_set_or_model_are_not_taken_for_ones_of_this(frozen, real, trained):
+    made, _, _ = frozen
+    others = replace(real, heights=real.heights + np.float32(0.5))
+    with pytest.raises(InputError, match=f"data set = '{others.fingerprint}': must be {real.fingerprint}"):
+        Transfer(FROZEN, Run.load(trained), trained, others, made.folder, Devices.all()).rows(ARMS[0], 0)
+    elsewhere = trained.parent / "elsewhere"
+    moved = Transfer(FROZEN, Run.load(trained), elsewhere, real, made.folder, Devices.all())
+    with pytest.raises(InputError, match=f"weights = '{elsewhere}': must be {trained}, as in the run so far"):
+        moved.rows(SYNTHETIC, 0)
+    assert len(moved.rows(SCRATCH, 0)) == 3

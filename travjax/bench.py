@@ -44,8 +44,9 @@ SEQUENTIAL = "sequential NumPy simulator"
 def machine() -> str:
     """The device and versions that a figure belongs to, in one line."""
     device = jax.devices()[0]
+    name = processor() if device.platform == "cpu" else device.device_kind
     versions = f"jax {jax.__version__}, Python {platform.python_version()}"
-    return f"{device.platform} {device.device_kind}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
+    return f"{device.platform} {name}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
 
 
 def processor() -> str:

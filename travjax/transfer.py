@@ -112,7 +112,9 @@ class Transfer:
 
     def rows(self, arm: str, seed: int) -> list[dict]:
         """A row for the first state and for each epoch of a run, which is trained as far as it is not yet."""
-        place = self.place_of(arm, seed)
+        place, run = self.place_of(arm, seed), self.run_of(arm, seed)
+        if has_checkpoints(place):
+            self._require_same(place, run)
         if not self._is_finished(place):
             self._train(arm, seed, place)
         return [row for row in read_rows(place / "metrics.jsonl") if "watched" in row]
@@ -126,12 +128,21 @@ class Transfer:
         """The synthetic model, untouched."""
         return load_estimator(self.synthetic, "best")[1]
 
+    def _require_same(self, place: Path, run: Run) -> None:
+        """A run that was begun goes on with what it began with, and so do its figures."""
+        begun = Run.load(place)
+        begun.require_same(run, f"{place}")
+        first = begun.preset.weights
+        require(first == run.preset.weights, f"{place}: weights", run.preset.weights, f"{first}, as in the run so far")
+
     def _is_finished(self, place: Path) -> bool:
         try:
-            position = load_meta(place / "checkpoints")["position"]
+            meta = load_meta(place / "checkpoints")
         except InputError:
             return False
-        return position["epoch"] == self.config.epochs
+        begun, given = meta["dataset"], self.dataset.fingerprint
+        require(begun == given, f"{place}: data set", given, f"{begun}, the one that the run was trained on")
+        return meta["position"]["epoch"] == self.config.epochs
 
     def _train(self, arm: str, seed: int, place: Path) -> None:
         run = self.run_of(arm, seed)

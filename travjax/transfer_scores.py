@@ -157,7 +157,7 @@ def arms_table(results: Results) -> str:
         shown = {name: f"{value:.2f}" for name, value in figures.items()} if figures else {"f1": "near 0"}
         site = "paper: its own" if arm == next(iter(PAPER_BEST)) else ""
         rows.append(dict.fromkeys(ARM_COLUMNS) | {"site": site, "arm": arm} | shown)
-    return with_notes(rows_table(rows, ARM_COLUMNS), _undefined(results))
+    return with_notes(rows_table(rows, ARM_COLUMNS), _undefined(results, rows))
 
 
 EVENT_COLUMNS = {
@@ -195,7 +195,7 @@ def events_table(results: Results, arm: str) -> str:
         place = {"site": "paper: its own" if event == NAMES[0] else "", "event": event, "state": "paper, transferred"}
         place |= {"failures": f"{paper.failures:.2%}", "always": mean_and_spread([always_fails(paper).f1])}
         rows.append(place | _figures([paper], ("accuracy", "recall", "precision", "f1")))
-    notes = [*_undefined(results), "tilt in the paper: no sample fails, so its figures are undefined"]
+    notes = [*_undefined(results, rows), "tilt in the paper: no sample fails, so its figures are undefined"]
     return with_notes(rows_table(rows, EVENT_COLUMNS), notes)
 
 
@@ -216,15 +216,16 @@ def mean_and_spread(values: Sequence[float]) -> str:
     return f"{np.mean(values):.3f}{spread}"
 
 
-def _undefined(results: Results) -> list[str]:
-    """Why figures of some events and sites are a dash."""
+def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
+    """Why figures of some events and sites in the rows of a table are a dash."""
     none = [
         f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
         for site in results.sites
         for event in NAMES
         if not results.always(site, event).tp
     ]
-    return [*none, "a dash under precision: in some seed nothing is predicted to fail"]
+    dashes = any(row.get(name) == "-" for row in rows for name in ("precision", "chosen_precision"))
+    return none + ["a dash under precision: in some seed nothing is predicted to fail"] * dashes
 
 
 def results_json(results: Results) -> dict:

@@ -123,7 +123,7 @@ def _write(transfer, results, out: Path) -> None:
     from travjax import curves, plots
     from travjax.bench import machine
     from travjax.statistics import statistics_table
-    from travjax.transfer import SYNTHETIC
+    from travjax.transfer import IMAGENET, SYNTHETIC
     from travjax.transfer_scores import arms_table, events_table, results_json
 
     config, base = transfer.config, transfer.base
@@ -152,6 +152,8 @@ def _write(transfer, results, out: Path) -> None:
         f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_count(transfer):,} samples "
         f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
     )
+    if base.preset.weights == "none":
+        intro += f" Without ImageNet weights the arm {IMAGENET} begins with random ones as well."
     synthetic = transfer.synthetic / TABLES
     sections = {"Synthetic test maps": synthetic.read_text().strip()} if synthetic.exists() else {}
     sections |= tables
