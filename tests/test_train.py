@@ -120,7 +120,7 @@ def test_steps_of_the_heads_are_those_of_numpy():
         before = heads
         heads, nu, wanted = numpy_step(heads, nu, features.astype(float), failed, weight, 0.01, 0.05)
         state, loss = update(
-            state, features, failed, weight, 0, step, graph=graph, phase=1, optimizer=optimizer, weight_decay=0.05
+            state, features, failed, weight, 0, step, graph=graph, phase=1, optimizer=optimizer, penalty=0.05
         )
         assert float(loss) == pytest.approx(wanted, rel=1e-5)
         actual = host(state["heads"]["heads"])
@@ -157,7 +157,7 @@ def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
         graph=graph,
         phase=2,
         optimizer=optimizer,
-        weight_decay=PRESET.training.weight_decay,
+        penalty=PRESET.training.weight_decay,
     )
     key = jax.random.fold_in(jax.random.key(11), 4)
     logits, after = in_training(*take_apart(made), images_of(samples), key)
@@ -196,7 +196,7 @@ def test_a_narrow_trunk_learns_32_samples_by_heart():
             graph=graph,
             phase=2,
             optimizer=optimizer,
-            weight_decay=0.0,
+            penalty=0.0,
         )
         losses.append(float(loss))
     assert losses[0] > 1.5
@@ -242,7 +242,7 @@ def test_features_of_another_run_of_the_same_trunk_may_be_set(tmp_path, monkeypa
     first = begun(tmp_path / "first", head_epochs=1, epochs=0)
     features = first.features
     first.train()
-    monkeypatch.setattr("travjax.train.over_samples", None)  # what would compute them
+    monkeypatch.setattr("travjax.train.features_of", None)  # what would compute them
     second = begun(tmp_path / "second", head_epochs=1, epochs=0)
     second.features = features
     second.train()

@@ -40,14 +40,14 @@ def real():
 def frozen(trained, real, tmp_path_factory):
     """An experiment with frozen trunks, its rows, and how often features of samples were computed."""
     computed: list[str] = []
-    over_samples, folder = train.over_samples, tmp_path_factory.mktemp("frozen")
+    features_of, folder = train.features_of, tmp_path_factory.mktemp("frozen")
 
-    def counted(function, *arguments):
-        computed.append(function.__name__)
-        return over_samples(function, *arguments)
+    def counted(*arguments):
+        computed.append("features")
+        return features_of(*arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(train, "over_samples", counted)
+        patch.setattr(train, "features_of", counted)
         made = Transfer(FROZEN, Run.load(trained), trained, real, folder, Devices.all())
         rows = run_all(made, lambda arm, seed: None)
     return made, rows, computed

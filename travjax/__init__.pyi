@@ -5,6 +5,7 @@ from .config import InputError
 from .dem import load_dem
 from .grid import Grid
 from .inputs import render_inputs
+from .predictor import predict
 from .robot import Robot
 from .terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 from .traverse import EVENTS, Margins, failures, label, simulate
@@ -25,6 +26,7 @@ __all__ = [
     "generate_terrain",
     "label",
     "load_dem",
+    "predict",
     "render_inputs",
     "sample_params",
     "simulate",

@@ -4,10 +4,10 @@ import argparse
 from collections.abc import Sequence
 
 import travjax
-from travjax.commands import bench, dataset, evaluate, label, terrain, train, weights
+from travjax.commands import bench, dataset, evaluate, export, label, predict, terrain, train, weights
 from travjax.entry import Parser, guarded, use_compilation_cache
 
-COMMANDS = (terrain, label, dataset, weights, train, evaluate, bench)
+COMMANDS = (terrain, label, dataset, weights, train, evaluate, export, predict, bench)
 """In the order in which the help lists them."""
 
 

@@ -1,6 +1,7 @@
 """The estimator: a ResNet trunk and a head for each event (SPEC section 8)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -108,7 +109,7 @@ def create(
     return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(seed + 1)))
 
 
-def take_apart(estimator: Estimator) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:
+def take_apart(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:
     """What is fixed of an estimator, and its VARIABLES."""
     graph, *states = nnx.split(
         estimator,
@@ -119,6 +120,6 @@ def take_apart(estimator: Estimator) -> tuple[nnx.GraphDef, dict[str, nnx.State]
     return graph, dict(zip(VARIABLES, states, strict=True))
 
 
-def put_together(graph: nnx.GraphDef, variables: dict[str, nnx.State]) -> Estimator:
+def put_together(graph: nnx.GraphDef, variables: dict[str, nnx.State]) -> Any:
     """The inverse of `take_apart`; the estimator has variables of its own."""
     return nnx.merge(graph, *(variables[name] for name in VARIABLES), copy=True)

@@ -9,12 +9,13 @@ from travjax import labelling, metrics
 from travjax.baselines import LogisticRegression, slope_and_step
 from travjax.config import require
 from travjax.dataset import Dataset, require_same
-from travjax.estimator import Estimator, take_apart
+from travjax.estimator import take_apart
 from travjax.inputs import ImageSource
+from travjax.map_data import MapSource
 from travjax.parallel import Devices
-from travjax.prediction import over_samples, probabilities, sample_logits
+from travjax.prediction import logits_of, probabilities
 from travjax.sampling import Samples, balanced_subset, every_sample, natural_sample
-from travjax.trained import Run
+from travjax.trained import Network, Run
 from travjax.traverse import as_in_paper, unpacked
 
 Progress = Callable[[int], object]
@@ -33,7 +34,7 @@ class Evaluator:
 
     run: Run
     dataset: Dataset
-    source: ImageSource
+    source: ImageSource | MapSource
     devices: Devices
 
     @staticmethod
@@ -41,8 +42,7 @@ class Evaluator:
         """Puts the images' parts on the devices."""
         require_same(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
-        scale = run.preset.elevation_scale
-        source = ImageSource.of(dataset.heights, run.robot, run.actions, run.grid, scale)
+        source = run.source(dataset.heights)
         return Evaluator(run, dataset, devices.replicate(source), devices)
 
     def samples(self, maps: int, each: int) -> Samples:
@@ -64,12 +64,12 @@ class Evaluator:
         return np.asarray(unpacked(self.dataset.labels[samples])[0])
 
     def probabilities(
-        self, estimator: Estimator, samples: Samples, on_progress: Progress = lambda count: None
+        self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
         """Of samples: [k, 3]."""
         graph, variables = take_apart(estimator)
         variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
-        logits = over_samples(sample_logits, graph, variables, self.source, samples, self.devices, size, on_progress)
+        logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
         return probabilities(logits)
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
@@ -81,7 +81,7 @@ class Evaluator:
         return test[labelling.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
 
     def whole_maps(
-        self, estimator: Estimator, maps: np.ndarray, on_progress: Progress = lambda count: None
+        self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
         """Probabilities of all trajectories of maps [k]: [k, t, 3]."""
         trajectories = len(self.run.actions)

@@ -51,6 +51,12 @@ class View:
         """The second radius of the map as it is that looks like `second` in this view."""
         return _opposite(actions)[second] if self.mirrored else second
 
+    def trajectories(self, actions: ActionSpace) -> np.ndarray:
+        """The trajectory of the map as it is that looks like each one in this view: [t] indices."""
+        turn, first, second = actions.split(np.arange(len(actions)))
+        turn, first = self.arc(turn, first, actions)
+        return actions.index(turn, first, self.second(second, actions))
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -104,7 +110,7 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     inside = f"at least half the track of {robot.name}, {robot.track / 2:g} m: a smaller one turns inside the robot"
     for radius in actions.radii:
         require(abs(radius) >= robot.track / 2, "radii", radius, inside)
-    views = _views(actions)
+    views = views_of(actions)
     turn, first = _first_arcs(actions, views)
     poses = _poses(actions, turn, first, np.arange(len(actions.radii)))
     flat = poses.reshape(-1, 3)
@@ -136,7 +142,8 @@ def _opposite(actions: ActionSpace) -> np.ndarray:
     return np.array([i if math.isinf(r) else radii.index(-r) for i, r in enumerate(radii)])
 
 
-def _views(actions: ActionSpace) -> tuple[View, ...]:
+def views_of(actions: ActionSpace) -> tuple[View, ...]:
+    """The views under which an action space looks like itself; the map as it is comes first."""
     turned = (False, True) if actions.turns % 2 == 0 else (False,)
     paired = all(math.isinf(radius) or -radius in actions.radii for radius in actions.radii)
     return tuple(View(t, m) for m in ((False, True) if paired else (False,)) for t in turned)

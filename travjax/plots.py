@@ -91,7 +91,7 @@ def labelled_maps(
 def predicted_maps(
     heights: np.ndarray,
     predictions: Mapping[str, np.ndarray],
-    failed: np.ndarray,
+    failed: np.ndarray | None,
     known: np.ndarray,
     titles: Sequence[str],
     robot: Robot,
@@ -100,11 +100,11 @@ def predicted_maps(
 ) -> Figure:
     """For each map the elevation and, for each event, the action space as predicted and in the last row the truth.
 
-    heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3]; known: [n, t].
-    The paper's qualitative figure.
+    heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3], None if that is
+    not to be shown; known: [n, t]. The paper's qualitative figure.
     """
     paths = actions.poses(np.arange(len(actions)))[..., :2]
-    rows = len(predictions) + 1
+    rows = len(predictions) + (failed is not None)
     figure = Figure(figsize=(13, 3.15 * rows * len(heights) + 0.5), layout="constrained")
     axes = figure.subplots(rows * len(heights), 4, sharex=True, sharey=True, squeeze=False)
     for one in range(len(heights)):
@@ -119,17 +119,22 @@ def predicted_maps(
         for ax in of_map[1:, 0]:
             ax.axis("off")
         for event, name in enumerate(EVENTS):
-            fails = failed[one, :, event]
             columns = [(what, values[one, :, event]) for what, values in predictions.items()]
             drawn = [(what, p >= FAILURE, _by_probability(p, known[one])) for what, p in columns]
-            drawn.append(("true", fails, _by_label(fails, known[one])))
+            if failed is not None:
+                fails = failed[one, :, event]
+                drawn.append(("true", fails, _by_label(fails, known[one])))
             for ax, (what, mask, by_colour) in zip(of_map[:, 1 + event], drawn, strict=True):
                 _draw_elevation(ax, heights[one], grid, *_colour_range(heights[one]), colour="gray", alpha=0.35)
                 _draw_paths(ax, paths, by_colour)
                 ax.set_title(_share_title(f"{name}, {what}", mask, known[one]), fontsize=9)
     for ax in axes[-1, 1:]:
         ax.set_xlabel("x, right [m]")
-    axes[1, 0].legend(handles=[Line2D([], [], color=colour, label=text) for colour, text in _BANDS], loc="center")
+    bands = [Line2D([], [], color=colour, label=text) for colour, text in _BANDS]
+    if rows > 1:
+        axes[1, 0].legend(handles=bands, loc="center")
+    else:
+        figure.legend(handles=bands, loc="outside lower center", ncols=len(bands))
     figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
     return figure
 

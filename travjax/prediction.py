@@ -4,16 +4,21 @@ from collections.abc import Callable
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
 from travjax.estimator import put_together
 from travjax.inputs import ImageSource
+from travjax.map_data import MapSource
 from travjax.parallel import Devices
 from travjax.sampling import Samples
 
 Variables = dict[str, nnx.State]
+
+MAPS = 4
+"""Maps whose hazard fields a device reads at once; a map takes some 100 MB."""
 
 
 @partial(jax.jit, static_argnames="graph")
@@ -38,13 +43,13 @@ def over_samples(
     function: Callable[..., Float[Array, "b f"]],
     graph: nnx.GraphDef,
     variables: Variables,
-    source: ImageSource,
-    samples: Samples,
+    source: ImageSource | MapSource,
+    samples: tuple[np.ndarray, ...],
     devices: Devices,
     batch_size: int = 64,
     on_progress: Callable[[int], object] = lambda count: None,
 ) -> Float[np.ndarray, "k f"]:
-    """`sample_logits` or `sample_features` of k samples, on the host.
+    """`sample_logits` or `sample_features` of k samples, or `map_hazards` of k maps, on the host.
 
     on_progress: is told how many samples were added
     """
@@ -70,6 +75,59 @@ def over_samples(
         collect(2)  # the device works while the host fetches
     collect(0)
     return results[0]
+
+
+@partial(jax.jit, static_argnames="graph")
+def map_hazards(graph, variables: Variables, source: MapSource, map_index):
+    """Logits, then margins in units of the limits, of all trajectories of maps [b]: [b, t, 6]."""
+    return jnp.concatenate(put_together(graph, variables)(source.elevation(map_index), source.stencil), axis=-1)
+
+
+def logits_of(
+    graph: nnx.GraphDef,
+    variables: Variables,
+    source: ImageSource | MapSource,
+    samples: Samples,
+    devices: Devices,
+    batch_size: int = 64,
+    on_progress: Callable[[int], object] = lambda count: None,
+) -> Float[np.ndarray, "k 3"]:
+    """Logits of k samples: one by one, or from the hazard field of each of their maps.
+
+    batch_size: samples at once; on_progress: is told how many samples were added
+    """
+    if isinstance(source, ImageSource):
+        return over_samples(sample_logits, graph, variables, source, samples, devices, batch_size, on_progress)
+    maps, place = np.unique(samples[0], return_inverse=True)
+    each = len(place) // len(maps)
+    added = hazards(graph, variables, source, maps, devices, lambda count: on_progress(count * each))
+    return added[place, samples[1], :3]
+
+
+def features_of(
+    graph: nnx.GraphDef,
+    variables: Variables,
+    source: ImageSource,
+    samples: Samples,
+    devices: Devices,
+    batch_size: int = 64,
+    on_progress: Callable[[int], object] = lambda count: None,
+) -> Float[np.ndarray, "k f"]:
+    """The trunk's features of k samples; arguments of `logits_of`."""
+    return over_samples(sample_features, graph, variables, source, samples, devices, batch_size, on_progress)
+
+
+def hazards(
+    graph: nnx.GraphDef,
+    variables: Variables,
+    source: MapSource,
+    maps: np.ndarray,
+    devices: Devices,
+    on_progress: Callable[[int], object] = lambda count: None,
+) -> Float[np.ndarray, "m t 6"]:
+    """`map_hazards` of maps [m], on the host."""
+    size = MAPS * devices.mesh.size
+    return over_samples(map_hazards, graph, variables, source, (maps,), devices, size, on_progress)
 
 
 def probabilities(logits: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:

@@ -6,12 +6,20 @@ from pathlib import Path
 import optax
 
 from travjax.config import load_toml, require, require_number
+from travjax.corruption import CorruptionConfig
 from travjax.dataset import DatasetConfig
 from travjax.estimator import HeadsConfig
+from travjax.field import FieldConfig
 from travjax.files import find_data
 from travjax.resnet import ResNetConfig
 
 SCHEDULES = ("constant", "cosine")
+
+METHODS = ("rmsprop", "adamw")
+
+RESNET, FIELD = "resnet50", "field"
+MODELS = (RESNET, FIELD)
+"""The estimators: of one trajectory at a time, and of all trajectories of a map at once."""
 
 
 def _require_counts(config: object, *names: str, least: int) -> None:
@@ -24,15 +32,21 @@ def _require_counts(config: object, *names: str, least: int) -> None:
 class TrainingConfig:
     """How the network is trained (SPEC section 9).
 
+    A sample is a map and a trajectory; for the hazard field it is a map.
+
     seed:                 of the subsets, their order, the heads' first values and dropout
     batch_size:           samples a step
     head_epochs:          phase 1: epochs of the heads on the features of the frozen trunk
     epochs:               phase 2: epochs of everything
-    learning_rate, decay, epsilon: of RMSprop
+    method:               "rmsprop", or "adamw" with its usual settings
+    learning_rate:        its largest
+    decay, epsilon:       of RMSprop
+    clip:                 gradients longer than this are cut to it; 0 leaves them as they are
     schedule:             of phase 2: "constant", or "cosine" down to zero
     warmup_steps:         steps of phase 2 over which the learning rate rises from zero
-    weight_decay:         times the sum of squares of the heads' kernels, added to the loss
-    each, failing:        trajectories a map in an epoch, and how many of them fail if as many do
+    weight_decay:         times the sum of squares of the heads' kernels, added to the loss; with "adamw" its own decay
+    each, failing:        trajectories a map in an epoch, and how many of them fail if as many do; for the hazard field
+                          trajectories a map in a step, whole first arcs of them, as frequent as they are
     fresh:                a new subset of trajectories each epoch instead of the same one (phase 2)
     subset_seed:          of the subsets alone, so that runs of other seeds train on the same samples; `seed` if none
     validation_samples:   at most this many of the validation maps' balanced subset
@@ -45,9 +59,11 @@ class TrainingConfig:
     batch_size: int = 64
     head_epochs: int = 1
     epochs: int = 10
+    method: str = "rmsprop"
     learning_rate: float = 1e-4
     decay: float = 0.9
     epsilon: float = 1e-7
+    clip: float = 0.0
     schedule: str = "constant"
     warmup_steps: int = 0
     weight_decay: float = 0.001
@@ -70,6 +86,8 @@ class TrainingConfig:
         require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
         require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
         require_number("epsilon", self.epsilon, 0, 1, "above 0 and at most 1")
+        require_number("clip", self.clip, -1e-300, 1e6, "from 0 to 1000000")
+        require(self.method in METHODS, "method", self.method, f"one of {', '.join(METHODS)}")
         require_number("weight_decay", self.weight_decay, -1e-300, 10, "from 0 to 10")
         require(self.schedule in SCHEDULES, "schedule", self.schedule, f"one of {', '.join(SCHEDULES)}")
         require(type(self.fresh) is bool, "fresh", self.fresh, "true or false")
@@ -90,8 +108,18 @@ class TrainingConfig:
         return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, max(steps, warmup + 1))
 
     def optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
-        """RMSprop for the `steps` of a phase."""
-        return optax.rmsprop(self.schedule_of(phase, steps), self.decay, self.epsilon, eps_in_sqrt=False)
+        """The method for the `steps` of a phase."""
+        rate = self.schedule_of(phase, steps)
+        if self.method == "adamw":
+            made = optax.adamw(rate, weight_decay=self.weight_decay)
+        else:
+            made = optax.rmsprop(rate, self.decay, self.epsilon, eps_in_sqrt=False)
+        return optax.chain(optax.clip_by_global_norm(self.clip), made) if self.clip else made
+
+    @property
+    def penalty(self) -> float:
+        """The weight decay that is part of the loss."""
+        return 0.0 if self.method == "adamw" else self.weight_decay
 
 
 @dataclass(frozen=True)
@@ -112,23 +140,35 @@ class EvaluationConfig:
 class Preset:
     """A training run.
 
+    model:           the estimator, one of MODELS
     robot:           a preset or a .toml file
     weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones
     elevation_scale: metres that count as 1 in the elevation channel
 
-    The rest are the tables of the file.
+    The rest are the tables of the file: trunk and heads are those of the ResNet, field is the hazard field's, and so is
+    corruption, what it sees of its training maps.
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
     """
 
+    model: str = RESNET
     robot: str = "seekur_jr"
     weights: str = "imagenet/resnet50_imagenet.npz"
     elevation_scale: float = 1.0
     dataset: DatasetConfig = DatasetConfig()
     trunk: ResNetConfig = ResNetConfig()
     heads: HeadsConfig = HeadsConfig()
+    field: FieldConfig = FieldConfig()
+    corruption: CorruptionConfig = CorruptionConfig()
     training: TrainingConfig = TrainingConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def __post_init__(self):
+        require(self.model in MODELS, "model", self.model, f"one of {', '.join(MODELS)}")
+        if self.model == FIELD:
+            require(self.weights == "none", "weights", self.weights, '"none": the hazard field begins with random ones')
+            epochs = self.training.head_epochs
+            require(epochs == 0, "[training] head_epochs", epochs, "0: the hazard field has no frozen trunk")
         for name in ("robot", "weights"):
             value = getattr(self, name)
             require(isinstance(value, str) and bool(value), name, value, "a non-empty text")

@@ -7,6 +7,7 @@ first block. Parameters and statistics are float32 whatever the type of the acti
 
 from dataclasses import dataclass
 from string import ascii_lowercase
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -60,6 +61,16 @@ class ResNetConfig:
         return EXPANSION * self.width * 2 ** (len(self.blocks) - 1)
 
 
+class NormConfig(Protocol):
+    """What a batch normalisation needs of a configuration."""
+
+    @property
+    def epsilon(self) -> float: ...
+
+    @property
+    def momentum(self) -> float: ...
+
+
 class ConvNorm(nnx.Module):
     """A convolution without bias and its batch normalisation.
 
@@ -67,7 +78,7 @@ class ConvNorm(nnx.Module):
     scale, bias, mean, var: [out]
     """
 
-    def __init__(self, inputs: int, outputs: int, size: int, stride: int, config: ResNetConfig, *, rngs: nnx.Rngs):
+    def __init__(self, inputs: int, outputs: int, size: int, stride: int, config: NormConfig, *, rngs: nnx.Rngs):
         self.kernel = nnx.Param(_he_normal(rngs.params(), (size, size, inputs, outputs), jnp.float32))
         self.scale = nnx.Param(jnp.ones(outputs, jnp.float32))
         self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))

@@ -23,13 +23,14 @@ from travjax import metrics
 from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, require
 from travjax.dataset import Dataset, require_same
-from travjax.estimator import VARIABLES, Estimator, take_apart
+from travjax.estimator import VARIABLES, take_apart
 from travjax.inputs import ImageSource
+from travjax.map_data import MapSource
 from travjax.parallel import Devices
-from travjax.prediction import feature_logits, over_samples, probabilities, sample_features, sample_logits
+from travjax.prediction import feature_logits, features_of, logits_of, probabilities
 from travjax.runlog import RunLog
 from travjax.sampling import Samples
-from travjax.trained import TRAINED, Run
+from travjax.trained import TRAINED, Network, Run
 from travjax.training_data import TrainingData
 from travjax.training_step import State, is_finite, update
 
@@ -80,7 +81,7 @@ class Trainer:
         devices.check_batch(run.preset.training.batch_size)
         self.run, self.folder, self.devices = run, folder, devices
         self.config = run.preset.training
-        self.data = TrainingData(dataset, self.config)
+        self.data = self._data(dataset)
         self.quiet = quiet or not devices.main
         self.scored = {"validation": self.data.validation} | dict(watched or {})
         self.checkpoints = Checkpoints(folder / "checkpoints")
@@ -89,13 +90,14 @@ class Trainer:
         self.graph = run.graph()
         self.log: RunLog | None = None
 
+    def _data(self, dataset: Dataset) -> TrainingData:
+        return TrainingData(dataset, self.config)
+
     @cached_property
-    def source(self) -> ImageSource:
-        """Images of all samples, on the devices."""
-        run = self.run
-        with self._bar("trajectory bank", len(run.actions), "trajectory") as bar:
-            heights, scale = self.data.dataset.heights, run.preset.elevation_scale
-            source = ImageSource.of(heights, run.robot, run.actions, run.grid, scale, bar.update)
+    def source(self) -> ImageSource | MapSource:
+        """Images of all samples, or all maps, on the devices."""
+        with self._bar("trajectory bank", len(self.run.actions), "trajectory") as bar:
+            source = self.run.source(self.data.dataset.heights, bar.update)
         return self.devices.replicate(source)
 
     @cached_property
@@ -103,9 +105,9 @@ class Trainer:
         """The frozen trunk's features of the samples of phase 1, computed once; those of a run of the same trunk and
         samples may be set instead."""
         samples = {"training": self.data.samples(1, 0)} | self.scored
-        return {name: self._over(sample_features, part, f"{name} features") for name, part in samples.items()}
+        return {name: self._over(features_of, part, f"{name} features") for name, part in samples.items()}
 
-    def start(self, estimator: Estimator) -> None:
+    def start(self, estimator: Network) -> None:
         """Begins with an estimator, whose trunk phase 1 leaves as it is."""
         variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
         self.state: State = self.devices.replicate(variables)
@@ -215,7 +217,7 @@ class Trainer:
             graph=self.graph,
             phase=phase,
             optimizer=self._optimizer(phase),
-            weight_decay=self.config.weight_decay,
+            penalty=self.config.penalty,
         )
         return loss
 
@@ -271,7 +273,7 @@ class Trainer:
             features = self.devices.replicate(self.features[name])
             logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
         else:
-            logits = self._over(sample_logits, self.scored[name], name)
+            logits = self._over(logits_of, self.scored[name], name)
         if not np.isfinite(logits).all():
             raise self._diverged(f"a {name} logit that is no number", self.position.step)
         return logits
@@ -288,7 +290,7 @@ class Trainer:
         variables = self._variables
         with self._bar(what, len(samples[0])) as bar:
             size = self.config.batch_size
-            return over_samples(function, self.graph, variables, self.source, samples, self.devices, size, bar.update)
+            return function(self.graph, variables, self.source, samples, self.devices, size, bar.update)
 
     def _meta(self, optimizer: int) -> dict[str, Any]:
         """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""

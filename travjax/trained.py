@@ -2,29 +2,41 @@
 
 import dataclasses
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from flax import nnx
 
+import travjax.estimator
+import travjax.field
 from travjax.actions import ActionSpace
 from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, from_json, to_json
-from travjax.estimator import Estimator, create, put_together, take_apart
+from travjax.estimator import Estimator, put_together, take_apart
+from travjax.field import HazardField
 from travjax.files import written_whole
 from travjax.grid import Grid
-from travjax.preset import Preset
+from travjax.imagenet import Weights
+from travjax.inputs import ImageSource
+from travjax.map_data import MapSource
+from travjax.preset import FIELD, Preset
 from travjax.robot import Robot
 
-TRAINED = {1: ("heads",), 2: ("trunk", "heads")}
-"""What each phase trains."""
+TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
+"""What each phase trains, and training of the hazard field."""
 
 DATA = "data"
 """Folder of a run's own data set."""
 
 _PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
+
+
+Network = Estimator | HazardField
+"""An estimator of either model."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +53,26 @@ class Run:
 
     def save(self, folder: Path) -> Path:
         """Writes run.json."""
-        table = {name: to_json(getattr(self, name)) for name in _PARTS}
         path = folder / "run.json"
         with written_whole(path) as temporary:
-            temporary.write_text(json.dumps(table, indent=1) + "\n")
+            temporary.write_text(json.dumps(self.to_json(), indent=1) + "\n")
         return path
+
+    def to_json(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        return {name: to_json(getattr(self, name)) for name in _PARTS}
+
+    @staticmethod
+    def from_json(table: dict[str, Any]) -> "Run":
+        """The inverse of `to_json`; raises all sorts over another table."""
+        return Run(**{name: from_json(table[name], kind) for name, kind in _PARTS.items()})
 
     @staticmethod
     def load(folder: str | Path) -> "Run":
         """Reads run.json; raises InputError when it is missing or wrong."""
         path = Path(folder) / "run.json"
         try:
-            table = json.loads(path.read_text())
-            return Run(**{name: from_json(table[name], kind) for name, kind in _PARTS.items()})
+            return Run.from_json(json.loads(path.read_text()))
         except OSError as error:
             raise InputError(
                 f"{path}: cannot be read: {error.strerror}; allowed: the folder of a training run"
@@ -70,15 +89,30 @@ class Run:
             if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {others!r}: must be {mine!r}, as in the run so far")
 
+    def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
+        """An estimator with random parameters, or a ResNet with a trunk of `weights`."""
+        if self.preset.model == FIELD:
+            return travjax.field.create(self.preset.field, seed)
+        return travjax.estimator.create(self.preset.trunk, self.preset.heads, seed, weights)
+
+    def source(
+        self, heights: np.ndarray, on_progress: Callable[[int], object] = lambda count: None
+    ) -> ImageSource | MapSource:
+        """Maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
+        scale = self.preset.elevation_scale
+        if self.preset.model == FIELD:
+            return MapSource.of(heights, self.robot, self.actions, self.grid, scale)
+        return ImageSource.of(heights, self.robot, self.actions, self.grid, scale, on_progress)
+
     def graph(self) -> nnx.GraphDef:
         """What is fixed of the estimator."""
-        return take_apart(nnx.eval_shape(lambda: create(self.preset.trunk, self.preset.heads)))[0]
+        return take_apart(nnx.eval_shape(self.create))[0]
 
     def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
         """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
 
         def state():
-            variables = take_apart(create(self.preset.trunk, self.preset.heads))[1]
+            variables = take_apart(self.create())[1]
             if phase:
                 trained = {name: variables[name] for name in TRAINED[phase]}
                 variables |= {"optimizer": self.preset.training.optimizer(phase, 1).init(trained)}
@@ -103,7 +137,7 @@ def has_checkpoints(folder: Path) -> bool:
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
-def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Estimator, dict]:
+def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)

@@ -4,6 +4,7 @@ The state is a dict of pytrees: parameters of "trunk" and "heads", the trunk's r
 state of what the phase trains.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -13,44 +14,65 @@ import optax
 from flax import nnx
 
 from travjax.estimator import Estimator, put_together
+from travjax.field import HazardField
+from travjax.preset import FIELD
 from travjax.trained import TRAINED
 
 State = dict[str, Any]
 
 
-def _heads_alone(estimator: Estimator, features, key):
-    return estimator.heads(features, key)
+def _of_heads(estimator: Estimator, features, failed, key):
+    return _entropy(estimator.heads(features, key), failed)
 
 
-def _everything(estimator: Estimator, inputs, key):
+def _of_samples(estimator: Estimator, inputs, failed, key):
     source, map_index, trajectory_index = inputs
-    return estimator(source.images(map_index, trajectory_index), train=True, key=key)
+    return _entropy(estimator(source.images(map_index, trajectory_index), train=True, key=key), failed)
 
 
-FORWARD = {1: _heads_alone, 2: _everything}
-"""The logits of a training step of each phase."""
+def _of_maps(estimator: HazardField, inputs, targets, key):
+    """Mean over the known trajectories of a map; targets: margins [b, t, 3] in units of the limits, known [b, t]."""
+    (elevation, stencil), (margins, known) = inputs, targets
+    logits, predicted = estimator(elevation, stencil, train=True)
+    off = optax.huber_loss(predicted, jnp.minimum(margins, LARGE_MARGIN), delta=SMALL_ERROR).sum(axis=-1)
+    loss = _entropy(logits, margins > 1) + estimator.trunk.config.margin_weight * off
+    return (loss * known).sum(axis=-1) / jnp.maximum(known.sum(axis=-1), 1)
 
 
-@partial(jax.jit, static_argnames=("graph", "phase", "optimizer", "weight_decay"), donate_argnames="state")
-def update(state: State, inputs, failed, weight, seed, step, *, graph, phase: int, optimizer, weight_decay: float):
-    """One step of a phase: the new state, and the mean over the batch of the cross-entropy summed over the events.
+def _entropy(logits, failed):
+    return optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1)
 
-    inputs: what FORWARD takes; failed: [b, 3]; weight: [b], 0 for a sample that only fills the batch up
+
+LOSS: dict[int | str, Callable] = {1: _of_heads, 2: _of_samples, FIELD: _of_maps}
+"""Of each sample of a batch, of each phase and of the hazard field: the cross-entropy summed over the events."""
+
+LARGE_MARGIN = 4.0
+"""Limits; margins are not told apart from there on."""
+
+SMALL_ERROR = 0.3
+"""Limits; up to there an error of a margin counts by its square."""
+
+
+@partial(jax.jit, static_argnames=("graph", "phase", "optimizer", "penalty"), donate_argnames="state")
+def update(state: State, inputs, targets, weight, seed, step, *, graph, phase: int | str, optimizer, penalty: float):
+    """One step of a phase: the new state, and the mean of the loss over the batch.
+
+    inputs, targets: what LOSS[phase] takes; weight: [b], 0 for a sample that only fills the batch up
+    penalty: times the sum of squares of the heads' kernels
     """
     key = jax.random.fold_in(jax.random.key(seed), step)
 
     def loss(parameters):
         estimator = put_together(graph, state | parameters)
-        logits = FORWARD[phase](estimator, inputs, key)
-        entropy = optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1)
-        entropy = (entropy * weight).sum() / weight.sum()
-        penalty = weight_decay * estimator.heads.squares()
-        return entropy + penalty, (entropy, nnx.state(estimator, nnx.BatchStat))
+        each = LOSS[phase](estimator, inputs, targets, key)
+        mean = (each * weight).sum() / weight.sum()
+        added = penalty * estimator.heads.squares() if penalty else 0.0
+        return mean + added, (mean, nnx.state(estimator, nnx.BatchStat))
 
     parameters = {name: state[name] for name in TRAINED[phase]}
-    gradients, (entropy, statistics) = jax.grad(loss, has_aux=True)(parameters)
+    gradients, (mean, statistics) = jax.grad(loss, has_aux=True)(parameters)
     updates, moved = optimizer.update(gradients, state["optimizer"], parameters)
-    return state | optax.apply_updates(parameters, updates) | {"statistics": statistics, "optimizer": moved}, entropy
+    return state | optax.apply_updates(parameters, updates) | {"statistics": statistics, "optimizer": moved}, mean
 
 
 @jax.jit

@@ -24,7 +24,7 @@ from travjax.preset import TrainingConfig, find_weights
 from travjax.runlog import read_rows
 from travjax.sampling import Samples, natural_sample
 from travjax.train import Trainer
-from travjax.trained import Run, has_checkpoints, load_estimator
+from travjax.trained import Network, Run, has_checkpoints, load_estimator
 
 ARMS = ("random", "ImageNet", "ImageNet + synthetic")
 """What the runs begin with, in the paper's order."""
@@ -119,12 +119,12 @@ class Transfer:
             self._train(arm, seed, place)
         return [row for row in read_rows(place / "metrics.jsonl") if "watched" in row]
 
-    def estimator(self, arm: str, seed: int) -> Estimator:
+    def estimator(self, arm: str, seed: int) -> Network:
         """Of the epoch that is best on the validation windows."""
         return load_estimator(self.place_of(arm, seed), "best")[1]
 
     @cached_property
-    def pretrained(self) -> Estimator:
+    def pretrained(self) -> Network:
         """The synthetic model, untouched."""
         return load_estimator(self.synthetic, "best")[1]
 
@@ -157,7 +157,7 @@ class Transfer:
             self._share_features(trainer, arm)
         trainer.train()
 
-    def _first(self, arm: str, seed: int) -> Estimator:
+    def _first(self, arm: str, seed: int) -> Network:
         """Where a run begins; random trunks differ by seed unless they stay as they are."""
         preset = self.base.preset
         if arm == SYNTHETIC:

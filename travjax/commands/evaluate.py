@@ -16,10 +16,10 @@ from travjax.files import output_folder, written_whole
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from travjax.estimator import Estimator
     from travjax.evaluate import Evaluator
     from travjax.metrics import Confusion, Evaluation
     from travjax.sampling import Samples
+    from travjax.trained import Network
 
 RECALLS = (0.9, 0.99)
 """Recalls that thresholds are found for, unless others are asked for."""
@@ -123,7 +123,7 @@ def evaluate(
     return scores
 
 
-def _probabilities(evaluator: "Evaluator", estimator: "Estimator", samples: "Samples", what: str) -> np.ndarray:
+def _probabilities(evaluator: "Evaluator", estimator: "Network", samples: "Samples", what: str) -> np.ndarray:
     with tqdm(desc=what, total=len(samples[0]), unit="sample") as bar:
         return evaluator.probabilities(estimator, samples, bar.update)
 
@@ -195,7 +195,7 @@ def _write_tables(
 def _draw(
     out: Path,
     evaluator: "Evaluator",
-    estimator: "Estimator",
+    estimator: "Network",
     scores: "Evaluation",
     others: Mapping[str, "Evaluation"],
     maps: int,
@@ -209,7 +209,7 @@ def _draw(
         print(plots.save(_predictions(evaluator, estimator, maps), out / "predictions.png"))
 
 
-def _predictions(evaluator: "Evaluator", estimator: "Estimator", maps: int) -> "Figure":
+def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Figure":
     """Prediction over truth on the whole action space of test maps that fail neither nowhere nor everywhere."""
     from travjax import plots
     from travjax.traverse import unpacked

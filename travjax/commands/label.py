@@ -40,7 +40,7 @@ def add(commands: options.Commands) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Labels the maps, prints the shares that fail, and writes labels, shares and figures."""
     grid, robot, actions = options.configuration(arguments)
-    total, source, files = _maps(arguments, grid)
+    total, source, files = maps_of(arguments, grid)
     out = output_folder(arguments.out)
 
     batches = (labelled(batch, robot, actions, grid) for batch in source)
@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> None:
         _write_figures(maps, robot, actions, grid, out)
 
 
-def _maps(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
+def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of maps, batches of them, and how each DEM file was read."""
     unused = ("style", "count", "seed") if arguments.dem else options.DEM_OPTIONS
     for name in unused:

@@ -105,10 +105,9 @@ def train(
     Raises InputError before it trains: the folder holds a run that differs or is not to be gone on with, first weights
     or data set are missing or damaged or do not fit.
     """
-    from travjax.estimator import create
     from travjax.imagenet import load_weights
-    from travjax.preset import find_weights
-    from travjax.train import Trainer
+    from travjax.preset import RESNET, find_weights
+    from travjax.train_field import trainer_of
     from travjax.trained import has_checkpoints
 
     preset = wanted.preset
@@ -118,8 +117,8 @@ def train(
     devices.wait()
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
-    estimator = None if resumes else create(preset.trunk, preset.heads, preset.training.seed, weights)
-    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices)
+    estimator = None if resumes else wanted.create(preset.training.seed, weights)
+    trainer = trainer_of(wanted)(wanted, _dataset(data, wanted, folder, devices), folder, devices)
     output_folder(folder)
     if devices.main:
         wanted.save(folder)
@@ -128,7 +127,7 @@ def train(
         trainer.resume()
     else:
         trainer.start(estimator)
-        if devices.main:
+        if devices.main and preset.model == RESNET:
             print(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:

@@ -1,0 +1,95 @@
+"""What sensors do to elevation maps: noise, missing nodes, a coarser grid; and filling what is missing.
+
+All NumPy on the host. Maps are [n, rows, cols] metres.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy import ndimage
+
+from travjax.config import require_number
+
+Maps = Float[np.ndarray, "n rows cols"]
+
+
+@dataclass(frozen=True)
+class CorruptionConfig:
+    """What of the training maps is corrupted, each time anew; their labels stay those of the clean map.
+
+    share:   of the maps; the others are seen as they are
+    noise:   metres, largest standard deviation of the noise; it is uniform from 0
+    missing: largest share of missing nodes, uniform from 0, in half of the corrupted maps
+    coarse:  share of the corrupted maps of which only every second node is seen
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    share: float = 0.0
+    noise: float = 0.06
+    missing: float = 0.25
+    coarse: float = 0.2
+
+    def __post_init__(self):
+        require_number("noise", self.noise, -1e-300, 1, "metres, from 0 to 1")
+        for name, most in (("share", 1), ("missing", 0.9), ("coarse", 1)):
+            require_number(name, getattr(self, name), -1e-300, most, f"a share from 0 to {most}")
+
+
+def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) -> Maps:
+    """Maps as sensors may see them, filled where nodes are missing; float32."""
+    result = np.array(maps, np.float32)
+    for index in np.flatnonzero(rng.random(len(maps)) < config.share):
+        one = result[index : index + 1]
+        if rng.random() < config.coarse:
+            one = upsampled(one)
+        one = noisy(one, rng.uniform(0, config.noise), rng)
+        if rng.random() < 0.5:
+            one = filled(thinned(one, rng.uniform(0, config.missing), rng))
+        result[index] = one[0]
+    return result
+
+
+def noisy(maps: Maps, deviation: float, rng: np.random.Generator) -> Maps:
+    """With independent Gaussian noise at each node; deviation: metres."""
+    return maps + np.float32(deviation) * rng.standard_normal(maps.shape, dtype=np.float32)
+
+
+def thinned(maps: Maps, share: float, rng: np.random.Generator) -> Maps:
+    """With NaN for a share of the nodes, each independently."""
+    return np.where(rng.random(maps.shape) < share, np.float32(np.nan), maps)
+
+
+def upsampled(maps: Maps) -> Maps:
+    """From every second node, the others by bilinear interpolation.
+
+    maps: with an even number of cells along each edge
+    """
+    result = np.array(maps)
+    result[:, 1:-1:2, ::2] = (maps[:, :-2:2, ::2] + maps[:, 2::2, ::2]) / 2
+    result[:, :, 1:-1:2] = (result[:, :, :-2:2] + result[:, :, 2::2]) / 2
+    return result
+
+
+def filled(maps: Maps) -> Maps:
+    """With the height of the nearest known node where NaN; a map without any known node is flat."""
+    result = np.array(maps)
+    for one in result:
+        unknown = np.isnan(one)
+        if unknown.all():
+            one[:] = 0
+        elif unknown.any():
+            place = ndimage.distance_transform_edt(unknown, return_distances=False, return_indices=True)
+            one[:] = one[tuple(place)]
+    return result
+
+
+def smoothed(maps: Maps, deviation: float) -> Maps:
+    """By a Gaussian; deviation: nodes."""
+    return ndimage.gaussian_filter(maps, (0, deviation, deviation), mode="nearest")
+
+
+def median(maps: Maps) -> Maps:
+    """Of each 3 x 3 nodes."""
+    return ndimage.median_filter(maps, (1, 3, 3), mode="nearest")

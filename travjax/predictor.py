@@ -1,0 +1,111 @@
+"""Probabilities of failure for the whole action space, from maps alone, by a trained estimator."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from travjax.actions import ActionSpace
+from travjax.config import InputError, require
+from travjax.estimator import take_apart
+from travjax.grid import Grid
+from travjax.map_data import MapSource
+from travjax.model_file import SUFFIX, read_model
+from travjax.parallel import Devices
+from travjax.prediction import hazards, logits_of, probabilities
+from travjax.preset import FIELD
+from travjax.robot import Robot
+from travjax.sampling import Samples
+from travjax.trained import Network, Run, load_estimator
+from travjax.traverse import Heights, as_maps
+
+WEIGHTS = Path(__file__).parent / "weights"
+"""The estimators that come with the package."""
+
+DEFAULT = "field_seekur_jr"
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What an estimator says of the trajectories of maps.
+
+    probability: [n, t, 3] of step, obstacle and tilt failures
+    margins:     [n, t, 3] metres, metres, radians; None of an estimator that has none
+    """
+
+    probability: Float[np.ndarray, "*n t 3"]
+    margins: Float[np.ndarray, "*n t 3"] | None
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained estimator, and the run that it comes from."""
+
+    run: Run
+    network: Network
+
+    @staticmethod
+    def load(source: str | Path | None = None, which: str = "best") -> "Predictor":
+        """The estimator of a file, of a training run's folder, or the one that comes with the package.
+
+        which: checkpoint of a folder
+        Raises InputError when there is none, or it is damaged.
+        """
+        path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else Path(source)
+        if path.is_dir():
+            return Predictor(*load_estimator(path, which)[:2])
+        if path.suffix != SUFFIX:
+            raise InputError(f"{path}: no estimator; allowed: the folder of a training run, or a {SUFFIX} file")
+        return Predictor(*read_model(path)[:2])
+
+    def require_same(self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None):
+        """Raises InputError that names both when something else is given than the estimator was trained for."""
+        run = self.run
+        if robot:
+            same = " of other dimensions or limits" if robot.name == run.robot.name else ""
+            allowed = f"{run.robot.name}{same}, which the estimator was trained for"
+            require(robot == run.robot, "robot", robot.name, allowed)
+        for name, given, own in (("actions", actions, run.actions), ("grid", grid, run.grid)):
+            require(given in (None, own), name, given, f"{own}, which the estimator was trained for")
+
+    def predict(self, heights: Heights, on_progress: Callable[[int], object] = lambda count: None) -> Predicted:
+        """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid.
+
+        An unknown node counts as the nearest known one. on_progress: is told how many trajectories were added
+        Raises InputError when heights have another shape or are no numbers.
+        """
+        maps, devices = np.asarray(as_maps(heights, self.run.grid)), Devices.all()
+        graph, variables = take_apart(self.network)
+        variables, source = devices.replicate(variables), devices.replicate(self.run.source(maps))
+        every, trajectories = np.arange(len(maps)), len(self.run.actions)
+        margins = None
+        if isinstance(source, MapSource):
+            told = lambda count: on_progress(count * trajectories)
+            logits, margins = np.split(hazards(graph, variables, source, every, devices, told), 2, axis=-1)
+            margins = margins * np.asarray(self.run.robot.limits, np.float32)
+        else:
+            samples: Samples = (np.repeat(every, trajectories), np.tile(np.arange(trajectories), len(maps)))
+            size = 64 * devices.mesh.size
+            logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
+            logits = logits.reshape(len(maps), trajectories, -1)
+        one = (lambda array: array[0]) if jnp.ndim(heights) == 2 else (lambda array: array)
+        return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
+
+
+def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t 3"]:
+    """Probabilities of step, obstacle and tilt failures for every trajectory of every map.
+
+    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model is for others
+    model:   folder of a training run, or .safetensors file; the hazard field for the Seekur Jr that comes with the
+             package unless given
+    Returns [n, t, 3], or [t, 3] for one map. Raises InputError for heights or a model that cannot be.
+    """
+    return Predictor.load(model).predict(heights).probability
+
+
+def is_field(predictor: Predictor) -> bool:
+    """Whether it reads all trajectories of a map at once."""
+    return predictor.run.preset.model == FIELD
