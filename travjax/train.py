@@ -8,7 +8,7 @@ import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -176,12 +176,11 @@ class Trainer:
         """From the present step to the end of the epoch, its validation and its checkpoint."""
         here, data = self.position, self.data
         steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
-        inputs_of = self._inputs()
         began = time.perf_counter()
         running: deque[tuple[jax.Array, float]] = deque()
         with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=int(done)) as bar:
-            for places, failed, weight in itertools.islice(data.batches(here.phase, here.epoch), here.step, None):
-                running.append((self._step(inputs_of(places), failed, weight), float(weight.sum())))
+            for inputs, failed, weight in self._batches():
+                running.append((self._step(inputs, failed, weight), float(weight.sum())))
                 here.step, here.total = here.step + 1, here.total + 1
                 saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
                 while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
@@ -194,6 +193,12 @@ class Trainer:
                 if saves:
                     self.checkpoints.save(here.total, self.state, self._meta(here.phase))
         self._finish_epoch((here.samples - done) / (time.perf_counter() - began))
+
+    def _batches(self) -> Iterator[tuple[Any, Any, np.ndarray]]:
+        """What the steps of this epoch take, from the present one on."""
+        here, inputs_of = self.position, self._inputs()
+        for places, failed, weight in itertools.islice(self.data.batches(here.phase, here.epoch), here.step, None):
+            yield inputs_of(places), failed, weight
 
     def _inputs(self) -> Callable[[np.ndarray], Any]:
         """What a step of this epoch takes, from the places of its samples; features are computed if need be."""

@@ -1,5 +1,9 @@
 """Training of the hazard field: the loop of train.py over whole maps instead of samples."""
 
+import itertools
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -21,8 +25,18 @@ class FieldTrainer(Trainer):
     def _data(self, dataset: Dataset) -> MapData:  # type: ignore[override]
         return MapData(dataset, self.run.preset)
 
-    def _inputs(self):
-        return lambda maps: self.data.prepared(maps, self.position.total)
+    def _batches(self) -> Iterator[tuple[Any, None, np.ndarray]]:
+        """As Trainer's; the next batch is prepared while a step runs."""
+        here, ahead = self.position, deque[tuple[Future, np.ndarray]]()
+        numbered = enumerate(self.data.batches(here.phase, here.epoch), here.total - here.step)
+        with ThreadPoolExecutor(1) as pool:
+            for step, (maps, _, weight) in itertools.islice(numbered, here.step, None):
+                ahead.append((pool.submit(self.data.prepared, maps, step), weight))
+                if len(ahead) == 2:
+                    prepared, weight = ahead.popleft()
+                    yield prepared.result(), None, weight
+            for prepared, weight in ahead:
+                yield prepared.result(), None, weight
 
     def _step(self, inputs: Any, failed: None, weight: np.ndarray) -> jax.Array:
         (elevation, stencil), targets = inputs
