@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -10,13 +11,15 @@ from travjax.baselines import LogisticRegression, slope_and_step
 from travjax.config import require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import take_apart
+from travjax.field import HazardField
 from travjax.inputs import ImageSource
 from travjax.map_data import MapSource
 from travjax.parallel import Devices
-from travjax.prediction import logits_of, probabilities
+from travjax.prediction import hazards, logits_of, probabilities
 from travjax.sampling import Samples, balanced_subset, every_sample, natural_sample
 from travjax.trained import Network, Run
-from travjax.traverse import as_in_paper, unpacked
+from travjax.training_step import LARGE_MARGIN
+from travjax.traverse import as_in_paper, simulate, unpacked
 
 Progress = Callable[[int], object]
 
@@ -71,6 +74,22 @@ class Evaluator:
         variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
         logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
         return probabilities(logits)
+
+    def margins(
+        self, network: HazardField, samples: Samples, on_progress: Progress = lambda count: None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
+
+        Both are cut off where training does not tell them apart any more. on_progress: is told of maps
+        """
+        graph, variables = take_apart(network)
+        maps, place = np.unique(samples[0], return_inverse=True)
+        source = cast(MapSource, self.source)
+        found = hazards(graph, self.devices.replicate(variables), source, maps, self.devices, on_progress)
+        run = self.run
+        simulated = simulate(self.dataset.heights[maps], run.robot, run.actions, grid=run.grid).events()
+        true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
+        return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], 3:], true))  # type: ignore
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
         """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""

@@ -85,6 +85,25 @@ def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX
     raise InputError(f"{what} {name}: no such file here, {where}; allowed: {allowed}")
 
 
+def find_preset(given: str, experiment: str) -> Path:
+    """The file of a preset: `given` is a path, or a name such as "laptop" for experiments/EXPERIMENT/laptop.toml here.
+
+    Raises InputError that lists the names when there is no such file.
+    """
+    if Path(given).suffix == ".toml":
+        if Path(given).is_file():
+            return Path(given)
+        raise InputError(f"preset {given}: no such file")
+    folder = Path("experiments") / experiment
+    path = folder / f"{given}.toml"
+    if path.is_file():
+        return path
+    names = ", ".join(sorted(found.stem for found in folder.glob("*.toml") if found.is_file()))
+    elsewhere = f"a .toml file, or a name in a folder where {folder} holds presets"
+    allowed = f"{names}, or a .toml file" if names else elsewhere
+    raise InputError(f"preset {given}: no {path} here; allowed: {allowed}")
+
+
 def sha256(path: Path) -> str:
     """The checksum of a file, in hexadecimal; it is read piece by piece."""
     with path.open("rb") as file:

@@ -14,9 +14,9 @@ from travjax.estimator import take_apart
 from travjax.grid import Grid
 from travjax.map_data import MapSource
 from travjax.model_file import SUFFIX, read_model
+from travjax.models import FIELD
 from travjax.parallel import Devices
 from travjax.prediction import hazards, logits_of, probabilities
-from travjax.preset import FIELD
 from travjax.robot import Robot
 from travjax.sampling import Samples
 from travjax.trained import Network, Run, load_estimator

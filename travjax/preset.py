@@ -11,15 +11,12 @@ from travjax.dataset import DatasetConfig
 from travjax.estimator import HeadsConfig
 from travjax.field import FieldConfig
 from travjax.files import find_data
+from travjax.models import FIELD, MODELS, RESNET
 from travjax.resnet import ResNetConfig
 
 SCHEDULES = ("constant", "cosine")
 
 METHODS = ("rmsprop", "adamw")
-
-RESNET, FIELD = "resnet50", "field"
-MODELS = (RESNET, FIELD)
-"""The estimators: of one trajectory at a time, and of all trajectories of a map at once."""
 
 
 def _require_counts(config: object, *names: str, least: int) -> None:
@@ -166,7 +163,6 @@ class Preset:
     def __post_init__(self):
         require(self.model in MODELS, "model", self.model, f"one of {', '.join(MODELS)}")
         if self.model == FIELD:
-            require(self.weights == "none", "weights", self.weights, '"none": the hazard field begins with random ones')
             epochs = self.training.head_epochs
             require(epochs == 0, "[training] head_epochs", epochs, "0: the hazard field has no frozen trunk")
         for name in ("robot", "weights"):

@@ -11,7 +11,7 @@ import numpy as np
 
 from travjax.dataset import Dataset
 from travjax.map_data import MapData
-from travjax.preset import FIELD
+from travjax.models import FIELD
 from travjax.train import Trainer
 from travjax.trained import Run
 from travjax.training_step import update

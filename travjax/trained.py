@@ -15,7 +15,7 @@ import travjax.estimator
 import travjax.field
 from travjax.actions import ActionSpace
 from travjax.checkpoint import Checkpoints
-from travjax.config import InputError, from_json, to_json
+from travjax.config import InputError, from_json, require, to_json
 from travjax.estimator import Estimator, put_together, take_apart
 from travjax.field import HazardField
 from travjax.files import written_whole
@@ -23,7 +23,8 @@ from travjax.grid import Grid
 from travjax.imagenet import Weights
 from travjax.inputs import ImageSource
 from travjax.map_data import MapSource
-from travjax.preset import FIELD, Preset
+from travjax.models import FIELD
+from travjax.preset import Preset
 from travjax.robot import Robot
 
 TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
@@ -90,8 +91,12 @@ class Run:
                 raise InputError(f"{what}: {name} = {others!r}: must be {mine!r}, as in the run so far")
 
     def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
-        """An estimator with random parameters, or a ResNet with a trunk of `weights`."""
+        """An estimator with random parameters, or a ResNet with a trunk of `weights`.
+
+        Raises InputError for weights of another trunk, or where the hazard field is to begin with any.
+        """
         if self.preset.model == FIELD:
+            require(weights is None, "weights", self.preset.weights, '"none": the hazard field begins with random ones')
             return travjax.field.create(self.preset.field, seed)
         return travjax.estimator.create(self.preset.trunk, self.preset.heads, seed, weights)
 

@@ -15,7 +15,7 @@ from flax import nnx
 
 from travjax.estimator import Estimator, put_together
 from travjax.field import HazardField
-from travjax.preset import FIELD
+from travjax.models import FIELD
 from travjax.trained import TRAINED
 
 State = dict[str, Any]

@@ -19,17 +19,22 @@ from travjax.dataset import Dataset, require_same
 from travjax.estimator import Estimator, Heads, create
 from travjax.files import output_folder, save_npz
 from travjax.imagenet import load_weights
+from travjax.models import FIELD
 from travjax.parallel import Devices
 from travjax.preset import TrainingConfig, find_weights
 from travjax.runlog import read_rows
 from travjax.sampling import Samples, natural_sample
 from travjax.train import Trainer
+from travjax.train_field import trainer_of
 from travjax.trained import Network, Run, has_checkpoints, load_estimator
 
 ARMS = ("random", "ImageNet", "ImageNet + synthetic")
 """What the runs begin with, in the paper's order."""
 
 SCRATCH, IMAGENET, SYNTHETIC = ARMS
+
+FIELD_ARMS = (SCRATCH, "synthetic")
+"""Likewise of the hazard field, for which there are no ImageNet weights."""
 
 
 @dataclass(frozen=True)
@@ -99,10 +104,15 @@ class Transfer:
             require(config.shown in self.held_out, "shown", config.shown, allowed)
         find_weights(base.preset.weights)
 
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """What the runs begin with; the synthetic model is the last."""
+        return FIELD_ARMS if self.base.preset.model == FIELD else ARMS
+
     def run_of(self, arm: str, seed: int) -> Run:
         """What a run is made from: the synthetic model's settings, trained as the experiment says."""
         preset = self.base.preset
-        weights = {SCRATCH: "none", IMAGENET: preset.weights, SYNTHETIC: f"{self.synthetic}"}[arm]
+        weights = {SCRATCH: "none", IMAGENET: preset.weights}.get(arm, f"{self.synthetic}")
         training = replace(self.config.training, seed=seed, subset_seed=self.config.training.drawn_by)
         return replace(self.base, preset=replace(preset, weights=weights, training=training))
 
@@ -146,7 +156,7 @@ class Transfer:
 
     def _train(self, arm: str, seed: int, place: Path) -> None:
         run = self.run_of(arm, seed)
-        trainer = Trainer(run, self.dataset, output_folder(place), self.devices, watched=self.held_out)
+        trainer = trainer_of(run)(run, self.dataset, output_folder(place), self.devices, watched=self.held_out)
         if self.devices.main:
             run.save(place)
         if has_checkpoints(place):
@@ -160,8 +170,10 @@ class Transfer:
     def _first(self, arm: str, seed: int) -> Network:
         """Where a run begins; random trunks differ by seed unless they stay as they are."""
         preset = self.base.preset
-        if arm == SYNTHETIC:
+        if arm == self.arms[-1]:
             return self.pretrained
+        if preset.model == FIELD:
+            return self.base.create(seed)
         file = find_weights(preset.weights) if arm == IMAGENET else None
         weights = load_weights(file, preset.trunk) if file else None
         trunk_seed = self.config.seeds[0] if self.config.frozen else seed
@@ -196,8 +208,8 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
 
 def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
     """The rows of all runs by arm and seed, those of one seed after the other; on_run is told which one begins."""
-    results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in ARMS}
-    for arm in ARMS:
+    results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
+    for arm in transfer.arms:
         for seed in transfer.config.seeds:
             on_run(arm, seed)
             results[arm][seed] = transfer.rows(arm, seed)

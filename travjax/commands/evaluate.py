@@ -12,12 +12,13 @@ from tqdm import tqdm
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder, written_whole
+from travjax.models import RESNET
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from travjax.evaluate import Evaluator
-    from travjax.metrics import Confusion, Evaluation
+    from travjax.metrics import Evaluation
     from travjax.sampling import Samples
     from travjax.trained import Network
 
@@ -26,6 +27,8 @@ RECALLS = (0.9, 0.99)
 
 FIGURE_MAPS = 2
 """Maps in predictions.png, likewise."""
+
+MARGINS = "regressed margins above their limits"
 
 CALIBRATION = (
     "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by "
@@ -106,6 +109,7 @@ def evaluate(
     """
     from travjax import dataset
     from travjax.evaluate import Evaluator
+    from travjax.field import HazardField
     from travjax.parallel import Devices
     from travjax.trained import DATA, load_estimator
 
@@ -118,7 +122,13 @@ def evaluate(
     scores = evaluator.scores(_probabilities(evaluator, estimator, samples, "test samples"), samples, recalls)
     others = _baselines(folder, evaluator, samples, recalls) if baselines else {}
     description = _description(evaluator, samples, checkpoint, meta["position"])
-    _write_tables(out, scores, others, description, evaluator.paper)
+    errors = None
+    if isinstance(estimator, HazardField):
+        with tqdm(desc="margins", total=len(np.unique(samples[0])), unit="map") as bar:
+            predicted, true = evaluator.margins(estimator, samples, bar.update)
+        errors = np.abs(predicted - true).mean(axis=0) * np.asarray(trained.robot.limits)
+        others[MARGINS] = evaluator.scores(np.clip(predicted / 2, 0, 1), samples, recalls)  # 0.5 is the limit
+    _write_tables(out, scores, others, description, evaluator, errors)
     _draw(out, evaluator, estimator, scores, others, figure_maps)
     return scores
 
@@ -166,11 +176,14 @@ def _write_tables(
     scores: "Evaluation",
     others: Mapping[str, "Evaluation"],
     description: dict,
-    paper: "Mapping[str, Confusion] | None",
+    evaluator: "Evaluator",
+    errors: np.ndarray | None,
 ) -> None:
     from travjax import report
     from travjax.metrics import to_json
+    from travjax.traverse import EVENTS
 
+    paper = evaluator.paper
     average_precisions = {"network": scores.average_precision}
     average_precisions |= {name: other.average_precision for name, other in others.items()}
     headline = "{samples} samples of {maps} of {test_maps} test maps, {robot}; checkpoint {checkpoint}: phase {phase}, "
@@ -178,18 +191,33 @@ def _write_tables(
         (headline + "step {steps}").format(**description),
         report.metrics_table(scores, paper),
         report.threshold_table(scores, paper),
-        CALIBRATION,
+        *([CALIBRATION] if evaluator.run.preset.model == RESNET else []),
         report.groups_table(scores),
         report.baselines_table(average_precisions),
     ]
+    if errors is not None:
+        tables += [f"{MARGINS.capitalize()}:\n{report.metrics_table(others[MARGINS], paper)}", _margin_errors(errors)]
     text = "\n\n".join(tables)
     print(f"\n{text}\n")
     results = {"sample": description, "network": to_json(scores)}
     results |= {name: to_json(other) for name, other in others.items()}
+    if errors is not None:
+        results["margin_errors"] = dict(zip(EVENTS, errors.tolist(), strict=True))
     for name, content in (("tables.txt", text), ("evaluation.json", json.dumps(results, indent=1, allow_nan=False))):
         with written_whole(out / name) as temporary:
             temporary.write_text(content + "\n")
         print(out / name)
+
+
+def _margin_errors(errors: np.ndarray) -> str:
+    """One line on mean absolute errors [3]."""
+    from travjax.training_step import LARGE_MARGIN
+
+    step, obstacle, tilt = errors
+    return (
+        f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: step {step:.4f} m, "
+        f"obstacle {obstacle:.4f} m, tilt {np.degrees(tilt):.2f} degrees"
+    )
 
 
 def _draw(

@@ -10,6 +10,7 @@ from travjax.commands import label, options
 from travjax.config import require
 from travjax.files import output_folder, save_npz, written_whole
 from travjax.labelling import Batch, joined, labelled, samples, title
+from travjax.models import MODELS
 
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
@@ -17,8 +18,6 @@ PROBABILITY = 0.5
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
-    from travjax.preset import MODELS
-
     parser = commands.add_parser(
         "predict",
         help="predict failures on maps by a trained estimator",

@@ -9,7 +9,8 @@ from tqdm import tqdm
 
 from travjax.commands import options
 from travjax.config import InputError, require
-from travjax.files import output_folder
+from travjax.files import find_preset, output_folder
+from travjax.models import FOLDERS, MODELS, RESNET
 
 if TYPE_CHECKING:
     from travjax.dataset import Dataset
@@ -27,7 +28,14 @@ def add(commands: options.Commands) -> None:
         description="Makes or reads a data set, trains the heads on the frozen trunk, then everything, and keeps "
         "checkpoints, metrics.jsonl, TensorBoard files and a figure in one folder.",
     )
-    parser.add_argument("preset", type=Path, metavar="PRESET", help=".toml file, as in experiments/train")
+    parser.add_argument(
+        "preset",
+        nargs="?",
+        default="laptop",
+        metavar="PRESET",
+        help="smoke, laptop or paper of experiments/train, or of experiments/field, or a .toml file (laptop)",
+    )
+    parser.add_argument("--model", choices=MODELS, help="the estimator: of a named preset, one of both (resnet50)")
     add_run(parser)
     parser.add_argument(
         "--data", type=Path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
@@ -36,7 +44,7 @@ def add(commands: options.Commands) -> None:
         "--resume", action="store_true", help="go on from the latest checkpoint in --out, if there is one"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write to (runs/train/ and the preset's name)"
+        "--out", type=Path, metavar="DIR", help="folder to write to (runs/train/ or runs/field/, and the preset's name)"
     )
     group = parser.add_argument_group("several processes that train together")
     group.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
@@ -82,8 +90,11 @@ def run(arguments: argparse.Namespace) -> None:
         require(given, "--coordinator, --processes, --process", shared, "all three or none")
         join(*shared)
     devices = Devices.all()
-    wanted = run_of(Preset.load(arguments.preset), arguments)
-    folder, data = arguments.out or Path("runs/train") / arguments.preset.stem, arguments.data
+    path = find_preset(arguments.preset, FOLDERS[arguments.model or RESNET])
+    preset, data = Preset.load(path), arguments.data
+    require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
+    wanted = run_of(preset, arguments)
+    folder = arguments.out or Path("runs") / FOLDERS[preset.model] / path.stem
     train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
     if devices.main:
         print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")
@@ -106,7 +117,7 @@ def train(
     or data set are missing or damaged or do not fit.
     """
     from travjax.imagenet import load_weights
-    from travjax.preset import RESNET, find_weights
+    from travjax.preset import find_weights
     from travjax.train_field import trainer_of
     from travjax.trained import has_checkpoints
 

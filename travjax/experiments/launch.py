@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from travjax.config import InputError
 from travjax.entry import Parser, guarded, use_compilation_cache
 from travjax.files import written_whole
 
@@ -28,25 +27,6 @@ def launch(
         run(arguments)
 
     return guarded(work)
-
-
-def find_preset(given: str, experiment: str) -> Path:
-    """The file of a preset: `given` is a path, or a name such as "laptop" for experiments/EXPERIMENT/laptop.toml here.
-
-    Raises InputError that lists the names when there is no such file.
-    """
-    if Path(given).suffix == ".toml":
-        if Path(given).is_file():
-            return Path(given)
-        raise InputError(f"preset {given}: no such file")
-    folder = Path("experiments") / experiment
-    path = folder / f"{given}.toml"
-    if path.is_file():
-        return path
-    names = ", ".join(sorted(found.stem for found in folder.glob("*.toml") if found.is_file()))
-    elsewhere = f"a .toml file, or a name in a folder where {folder} holds presets"
-    allowed = f"{names}, or a .toml file" if names else elsewhere
-    raise InputError(f"preset {given}: no {path} here; allowed: {allowed}")
 
 
 def write_report(folder: Path, title: str, pieces: Sequence[Piece]) -> Path:

@@ -13,6 +13,7 @@ from travjax.bench import machine
 from travjax.commands import train
 from travjax.commands.evaluate import evaluate
 from travjax.experiments import launch
+from travjax.files import find_preset
 from travjax.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
 from travjax.parallel import Devices
 from travjax.preset import Preset
@@ -49,7 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains as far as that is not done yet, evaluates, and writes the report."""
-    path = launch.find_preset(arguments.preset, "train")
+    path = find_preset(arguments.preset, "train")
     wanted = train.run_of(Preset.load(path), arguments)
     folder = arguments.out or Path("runs/synthetic") / path.stem
     train.train(wanted, folder, Devices.all(), resume=True)

@@ -18,7 +18,7 @@ from travjax.bench_network import BATCH, Bench
 from travjax.commands import options
 from travjax.config import require
 from travjax.experiments import launch
-from travjax.files import output_folder, written_whole
+from travjax.files import find_preset, output_folder, written_whole
 from travjax.grid import Grid
 from travjax.parallel import Devices
 from travjax.preset import Preset
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     bench.check(robot, actions, grid)
     trunk = ResNetConfig()
     if arguments.network:
-        trunk = Preset.load(launch.find_preset(arguments.network, "train")).trunk
+        trunk = Preset.load(find_preset(arguments.network, "train")).trunk
     out = output_folder(arguments.out)
     rows = _of_paper() if actions == ActionSpace() else []
     rows += measured(robot, actions, grid, trunk, arguments.batch, arguments.repeats)

@@ -16,14 +16,15 @@ from tqdm import tqdm
 from travjax.commands import evaluate, train
 from travjax.config import InputError, load_toml, require, to_json
 from travjax.experiments import launch
-from travjax.files import output_folder, written_whole
+from travjax.files import find_preset, output_folder, written_whole
+from travjax.models import FIELD, MODELS, RESNET
 
 DESCRIPTION = (
     "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "
     "epoch on held-out sites: the second half of the paper. A run that was interrupted goes on."
 )
 
-COLOURS = {"random": "tab:gray", "ImageNet": "tab:blue", "ImageNet + synthetic": "tab:red"}
+COLOURS = {"random": "tab:gray", "ImageNet": "tab:blue", "ImageNet + synthetic": "tab:red", "synthetic": "tab:red"}
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -34,6 +35,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         default="laptop",
         metavar="PRESET",
         help="smoke, laptop or paper of experiments/transfer, or a .toml file (laptop)",
+    )
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        default=RESNET,
+        help=f"{FIELD} takes the preset PRESET_field ({RESNET})",
     )
     parser.add_argument("--data", type=Path, metavar="DIR", help="data set of real maps, instead of that of the sites")
     parser.add_argument(
@@ -53,7 +60,8 @@ def run(arguments: argparse.Namespace) -> None:
     from travjax.transfer import Transfer, TransferConfig, run_all
     from travjax.transfer_scores import Results
 
-    path = launch.find_preset(arguments.preset, "transfer")
+    suffix = "_field" if arguments.model == FIELD and Path(arguments.preset).suffix != ".toml" else ""
+    path = find_preset(arguments.preset + suffix, "transfer")
     config, devices = load_toml(path, TransferConfig), Devices.all()
     out = output_folder(arguments.out or Path("runs/transfer") / path.stem)
     _require_same(out, config)
@@ -123,14 +131,14 @@ def _write(transfer, results, out: Path) -> None:
     from travjax import curves, plots
     from travjax.bench import machine
     from travjax.statistics import statistics_table
-    from travjax.transfer import IMAGENET, SYNTHETIC
+    from travjax.transfer import IMAGENET
     from travjax.transfer_scores import arms_table, events_table, results_json
 
     config, base = transfer.config, transfer.base
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
     tables = {
         "First weights": arms_table(results),
-        f"Events, {SYNTHETIC}": events_table(results, SYNTHETIC),
+        f"Events, {transfer.arms[-1]}": events_table(results, transfer.arms[-1]),
         "Real maps": statistics_table(transfer.dataset, as_in_paper=False),
     }
     for title, table in tables.items():
@@ -152,7 +160,7 @@ def _write(transfer, results, out: Path) -> None:
         f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_count(transfer):,} samples "
         f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
     )
-    if base.preset.weights == "none":
+    if base.preset.weights == "none" and IMAGENET in transfer.arms:
         intro += f" Without ImageNet weights the arm {IMAGENET} begins with random ones as well."
     synthetic = transfer.synthetic / TABLES
     sections = {"Synthetic test maps": synthetic.read_text().strip()} if synthetic.exists() else {}
@@ -186,13 +194,12 @@ def _maps_figure(transfer):
     """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
     from travjax import plots
     from travjax.evaluate import Evaluator
-    from travjax.transfer import SYNTHETIC
     from travjax.traverse import unpacked
 
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.of(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)
-    models = {"before": transfer.pretrained, "after": transfer.estimator(SYNTHETIC, config.seeds[0])}
+    models = {"before": transfer.pretrained, "after": transfer.estimator(transfer.arms[-1], config.seeds[0])}
     predictions = {}
     for name, estimator in models.items():
         with tqdm(desc=f"maps for the figure, {name}", total=len(shown) * len(base.actions), unit="sample") as bar:
