@@ -3,6 +3,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= runs
 PRESET ?= laptop
+MODEL ?= resnet50
+RUN := $(OUT)/$(if $(filter field,$(MODEL)),field,train)/$(PRESET)
 EXTRAS ?= dev
 TRAVJAX_DATA ?= $(wildcard ../shared/data)
 YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
@@ -14,7 +16,8 @@ export TRAVJAX_DATA
 help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
 	@echo "make label   make and label 200 synthetic maps and the Mars Yard, into $(OUT)/label"
-	@echo "make train   train the estimator and evaluate it, into $(OUT)/train/$(PRESET); PRESET=smoke|laptop|paper ($(PRESET))"
+	@echo "make train   train an estimator and evaluate it, into $(RUN); PRESET=smoke|laptop|paper ($(PRESET)),"
+	@echo "             MODEL=resnet50|field ($(MODEL))"
 	@echo "             on an NVIDIA GPU: make clean, then make train PRESET=paper EXTRAS=dev,cuda"
 	@echo "make test    run the tests"
 	@echo "make check   lint, types and layering"
@@ -47,11 +50,12 @@ label: setup
 # Large pages for what malloc gives: a training step on a CPU takes a sixth less time with them.
 train: export GLIBC_TUNABLES ?= glibc.malloc.hugetlb=1
 train: setup
-	$(BIN)/travjax train experiments/train/$(PRESET).toml --resume --out $(OUT)/train/$(PRESET)
-	$(BIN)/travjax evaluate $(OUT)/train/$(PRESET)
+	$(BIN)/travjax train $(PRESET) --model $(MODEL) --resume --out $(RUN)
+	$(BIN)/travjax evaluate $(RUN)
 	@echo
 	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
-	@echo "Another robot: $(BIN)/travjax train experiments/train/$(PRESET).toml --robot husky_a200 --out DIR"
+	@echo "The hazard field: make train MODEL=field PRESET=smoke (1 minute), PRESET=laptop (an hour)."
+	@echo "Another robot: $(BIN)/travjax train $(PRESET) --model $(MODEL) --robot husky_a200 --out DIR"
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile

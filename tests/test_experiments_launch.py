@@ -7,6 +7,7 @@ import pytest
 
 from travjax.config import InputError
 from travjax.experiments import launch
+from travjax.files import find_preset
 
 pytestmark = pytest.mark.usefixtures("compilation_cache")
 
@@ -72,13 +73,13 @@ def test_help_names_the_module(capsys):
 
 
 def test_a_preset_is_found_by_its_name(here):
-    assert launch.find_preset("laptop", "train") == Path("experiments/train/laptop.toml")
+    assert find_preset("laptop", "train") == Path("experiments/train/laptop.toml")
 
 
 def test_a_preset_is_found_by_its_path(here):
     (here / "mine.toml").touch()
     for given in ("mine.toml", str(here / "mine.toml"), "experiments/train/smoke.toml"):
-        assert launch.find_preset(given, "train") == Path(given)
+        assert find_preset(given, "train") == Path(given)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +103,7 @@ def test_a_preset_is_found_by_its_path(here):
 )
 def test_a_preset_that_is_not_there_is_one_line(here, given, experiment, message):
     with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
-        launch.find_preset(given, experiment)
+        find_preset(given, experiment)
 
 
 # ---- Reports

@@ -9,6 +9,7 @@ import travjax
 
 ORDER = [
     "config",
+    "models",
     "files",
     "grid",
     "batching",

@@ -160,7 +160,8 @@ def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
     figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
     for ax, site in zip(axes, results.sites, strict=True):
-        for arm, colour in arms.items():
+        for arm in results.arms:
+            colour = arms[arm]
             f1 = np.nan_to_num(results.f1(arm, site))
             epochs = np.arange(f1.shape[1])
             ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)

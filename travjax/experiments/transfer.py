@@ -157,7 +157,7 @@ def _write(transfer, results, out: Path) -> None:
     with written_whole(out / "results.json") as temporary:
         temporary.write_text(json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
     intro = (
-        f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_count(transfer):,} samples "
+        f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_samples(transfer)} "
         f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
     )
     if base.preset.weights == "none" and IMAGENET in transfer.arms:
@@ -183,11 +183,13 @@ MEANING = (
 )
 
 
-def _count(transfer) -> int:
-    """Training samples of an epoch."""
+def _samples(transfer) -> str:
+    """What an epoch is trained on."""
     from travjax.training_data import TrainingData
 
-    return TrainingData(transfer.dataset, transfer.config.training).count(2, 0)
+    if transfer.base.preset.model == FIELD:
+        return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
+    return f"{TrainingData(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
 def _maps_figure(transfer):
