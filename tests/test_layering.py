@@ -54,6 +54,7 @@ ORDER = [
     "evaluate",
     "model_file",
     "predictor",
+    "robustness",
     "transfer",
     "plots",
     "report",
@@ -78,6 +79,7 @@ ORDER = [
     "experiments.transfer",
     "experiments.synthetic",
     "experiments.timing",
+    "experiments.comparison",
 ]
 """From the bottom to the top; __init__ and __main__ may import any of them."""
 

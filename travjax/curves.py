@@ -203,3 +203,51 @@ def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid 
     for ax in axes[-1]:
         ax.set_xlabel("x, right [m]")
     return figure
+
+
+def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
+    """F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
+
+    f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
+    """
+    figure = Figure(figsize=(12.5, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.3))
+    names = list(next(iter(f1.values())))
+    noisy = [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    width = 0.8 / len(f1)
+    for number, (method, of) in enumerate(f1.items()):
+        colour = f"C{number}"
+        left.plot(noises, [of[others[0]], *(of[name] for name in noisy)], "o-", color=colour, label=method)
+        places = np.arange(len(others)) + (number - (len(f1) - 1) / 2) * width
+        bars = right.bar(places, [of[name] for name in others], width, color=colour)
+        right.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    left.set(xlabel="noise at each node [cm]", ylabel=f"F1 at {THRESHOLD:g}, events pooled", ylim=(0, 1.05))
+    right.set_xticks(range(len(others)), [name if name != others[0] else "clean" for name in others])
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    left.legend(fontsize=9)
+    return figure
+
+
+def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
+    """F1 against the time for all trajectories of a map.
+
+    points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
+    """
+    figure = Figure(figsize=(9, 4.8), layout="constrained")
+    ax = figure.subplots()
+    for number, (name, (seconds, clean, noisy)) in enumerate(points.items()):
+        ax.plot([seconds, seconds], [clean, noisy], "-", color=f"C{number}", alpha=0.4)
+        ax.plot(seconds, clean, "o", color=f"C{number}", label=f"{name}: {seconds:.3g} s")
+        ax.plot(seconds, noisy, "v", color=f"C{number}")
+    ax.set_xscale("log")
+    ax.set(
+        xlabel="s for all trajectories of a map",
+        ylabel=f"F1 at {THRESHOLD:g}: o clean, v at 5 cm of noise",
+        ylim=(0, 1.05),
+    )
+    ax.grid(alpha=0.3)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    return figure
