@@ -1,0 +1,76 @@
+"""What tests of the hazard field share: a tiny preset, runs of it and estimators with random parameters."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+from commandline import FEW
+from training import GRID, HUSKY, dataset
+
+from travjax.corruption import CorruptionConfig
+from travjax.estimator import put_together, take_apart
+from travjax.field import FieldConfig, HazardField, create
+from travjax.parallel import Devices
+from travjax.preset import EvaluationConfig, Preset, TrainingConfig
+from travjax.train_field import FieldTrainer
+from travjax.trained import Run
+
+CONFIG = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, momentum=0.5)
+
+PRESET = Preset(
+    model="field",
+    robot="husky_a200",
+    weights="none",
+    elevation_scale=0.1,
+    dataset=dataset().config,
+    field=CONFIG,
+    corruption=CorruptionConfig(0.5, 0.02, 0.2, 0.5),
+    training=TrainingConfig(
+        method="adamw",
+        batch_size=4,
+        head_epochs=0,
+        epochs=2,
+        learning_rate=1e-2,
+        clip=1.0,
+        each=6,
+        checkpoint_steps=2,
+        validation_samples=40,
+    ),
+    evaluation=EvaluationConfig(),
+)
+"""18 training maps, so 5 steps an epoch, the last of which is filled up."""
+
+RUN = Run(PRESET, HUSKY, FEW, GRID)
+
+
+def random_variables(seed: int = 0):
+    """What is fixed of a tiny estimator, and variables that are random where `create` has zeros and ones."""
+    graph, variables = take_apart(create(CONFIG, seed))
+    rng = np.random.default_rng(seed)
+    # Scales and variances have to be positive; kernels are random already.
+    moved = lambda leaf: leaf + rng.uniform(0, 0.3, leaf.shape).astype(np.float32) if leaf.ndim == 1 else leaf
+    return graph, jax.tree.map(moved, variables)
+
+
+@functools.cache
+def estimator(seed: int = 0) -> HazardField:
+    """A tiny one with random parameters and statistics, not to be changed."""
+    return put_together(*random_variables(seed))
+
+
+def trainer(folder: Path, run: Run = RUN, **training) -> FieldTrainer:
+    """A trainer that has not begun."""
+    folder.mkdir(parents=True, exist_ok=True)
+    preset = replace(run.preset, training=replace(run.preset.training, **training))
+    run = replace(run, preset=preset)
+    run.save(folder)
+    return FieldTrainer(run, dataset(), folder, Devices.all(), quiet=True)
+
+
+def begun(folder: Path, **training) -> FieldTrainer:
+    """A trainer that has begun with an estimator of `create`."""
+    made = trainer(folder, **training)
+    made.start(made.run.create(made.config.seed))
+    return made

@@ -1,0 +1,144 @@
+"""A trained estimator as one file: it comes back bit for bit, and what is no such file is said in one line."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+import training
+from field_runs import RUN, estimator
+from safetensors import safe_open
+from safetensors.numpy import load_file, save, save_file
+from training import host, require_equal, run_of
+
+from travjax.config import InputError
+from travjax.estimator import take_apart
+from travjax.model_file import read_model, write_model
+
+NOTES = {"dataset": "0123", "epoch": 2, "step": 10, "score": 0.25}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """A tiny hazard field."""
+    write_model(tmp_path / "field.safetensors", RUN, estimator(), NOTES)
+    return tmp_path / "field.safetensors"
+
+
+def metadata(file) -> dict:
+    with safe_open(file, framework="np") as opened:
+        return opened.metadata()
+
+
+def rewritten(file, change=lambda arrays: arrays, described=None):
+    """The file with other arrays, or another description."""
+    arrays, notes = change(load_file(file)), metadata(file) if described is None else described
+    file.write_bytes(save(arrays, metadata=notes))
+    return file
+
+
+def refusal(file) -> str:
+    with pytest.raises(InputError) as raised:
+        read_model(file)
+    assert "\n" not in str(raised.value) and str(raised.value).startswith(f"{file}: ")
+    return str(raised.value).removeprefix(f"{file}: ")
+
+
+# ---- There and back
+
+
+def test_a_hazard_field_comes_back_bit_for_bit(file):
+    run, network, notes = read_model(file)
+    assert (run, notes) == (RUN, NOTES)
+    require_equal(host(take_apart(network)[1]), host(take_apart(estimator())[1]))
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(take_apart(network)[1]))
+
+
+def test_a_resnet_comes_back_bit_for_bit(tmp_path):
+    path, made = tmp_path / "resnet.safetensors", training.estimator()
+    write_model(path, run_of(), made, {})
+    run, network, notes = read_model(path)
+    assert (run, notes) == (run_of(), {})
+    require_equal(host(take_apart(network)[1]), host(take_apart(made)[1]))
+
+
+def test_the_same_estimator_gives_the_same_file_and_another_another(file, tmp_path):
+    for seed, same in ((0, True), (1, False)):
+        write_model(tmp_path / "again.safetensors", RUN, estimator(seed), NOTES)
+        assert ((tmp_path / "again.safetensors").read_bytes() == file.read_bytes()) is same
+
+
+def test_arrays_are_named_by_their_place(file):
+    arrays = load_file(file)
+    assert "trunk/trunk/stem/kernel" in arrays or any(name.endswith("stem/kernel") for name in arrays)
+    assert {name.split("/")[0] for name in arrays} == {"trunk", "heads", "statistics"}
+    assert sum(array.size for array in arrays.values()) == sum(
+        leaf.size for leaf in jax.tree.leaves(take_apart(estimator())[1])
+    )
+
+
+# ---- What is no such file
+
+
+def test_a_missing_file_is_named(tmp_path):
+    assert refusal(tmp_path / "none.safetensors") == "no such file"
+
+
+def test_a_folder_is_no_file(tmp_path):
+    (tmp_path / "folder.safetensors").mkdir()
+    assert refusal(tmp_path / "folder.safetensors").startswith("is a folder; allowed: a file")
+
+
+@pytest.mark.parametrize("left", [0, 5, 200, -1])
+def test_a_file_that_was_cut_off_is_refused(file, left):
+    file.write_bytes(file.read_bytes()[:left])
+    assert "damaged" in refusal(file)
+
+
+def test_arrays_of_something_else_are_refused(tmp_path):
+    save_file({"x": np.zeros(3, np.float32)}, tmp_path / "x.safetensors")
+    assert refusal(tmp_path / "x.safetensors") == (
+        "holds no estimator of travjax; allowed: a file of `travjax export`"
+    )
+
+
+@pytest.mark.parametrize(
+    "described",
+    [
+        {},
+        {"run": 3, "notes": {}},
+        {"run": {}, "notes": {}},
+        {"run": RUN.to_json()},
+        {"run": RUN.to_json() | {"preset": 3}, "notes": {}},
+        {"run": RUN.to_json() | {"actions": None}, "notes": {}},
+        {"run": RUN.to_json() | {"robot": {"name": "x"}}, "notes": {}},
+        [1, 2],
+    ],
+)
+def test_a_file_that_does_not_say_what_it_was_made_from_is_refused(file, described):
+    rewritten(file, described={"travjax": json.dumps(described)})
+    assert refusal(file)
+
+
+def changed(name: str, change) -> dict:
+    """A change of the first array whose name ends so."""
+
+    def of(arrays):
+        found = next(key for key in sorted(arrays) if key.endswith(name))
+        return arrays | {found: change(arrays[found])}
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (changed("kernel", lambda array: array[..., :-1].copy()), "kernel"),
+        (changed("bias", lambda array: array.astype(np.float64)), "bias"),
+        (lambda arrays: dict(sorted(arrays.items())[1:]), "heads/"),
+        (lambda arrays: arrays | {"more": np.zeros(1, np.float32)}, "more"),
+    ],
+)
+def test_arrays_that_are_not_its_own_are_named(file, change, named):
+    said = refusal(rewritten(file, change))
+    assert named in said.split(": not the arrays of its estimator; ")[0] and said.endswith("allowed: an undamaged file")
