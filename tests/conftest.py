@@ -171,8 +171,9 @@ def shared_code() -> Iterator[None]:
 
     def optimizer(config, phase, steps):
         steps = steps if config.schedule == "cosine" else 1
-        names = ("learning_rate", "decay", "epsilon", "schedule", "warmup_steps")
-        key = (phase, steps, *(getattr(config, name) for name in names))
+        names = ("method", "learning_rate", "decay", "epsilon", "clip", "schedule", "warmup_steps")
+        own = config.weight_decay if config.method == "adamw" else None
+        key = (phase, steps, own, *(getattr(config, name) for name in names))
         return made.setdefault(key, make(config, phase, steps))
 
     with pytest.MonkeyPatch.context() as patch:

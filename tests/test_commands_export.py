@@ -1,1 +1,136 @@
-"""Being written by the helper that has the list of issue 5: please leave it."""
+"""`travjax export`: the file, its model card, and the one line for each bad input."""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from commandline import FEW, files, run_words
+from field_runs import CONFIG, begun
+from training import copy, dataset, host, require_equal
+
+from travjax.checkpoint import load_meta
+from travjax.estimator import take_apart
+from travjax.model_file import read_model
+from travjax.predictor import Predictor
+from travjax.trained import load_estimator
+
+pytestmark = pytest.mark.usefixtures("shared_code")
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory) -> Path:
+    """The folder of a short run of a tiny hazard field."""
+    folder = tmp_path_factory.mktemp("field") / "run"
+    begun(folder, epochs=2).train()
+    return folder
+
+
+def exported(folder: Path, to: Path, *words) -> str:
+    code, out, err = run_words("export", folder, "--to", to, *words)
+    assert code == 0, err
+    return out
+
+
+def refusal(*words) -> str:
+    code, _, err = run_words("export", *words)
+    line = err.strip().splitlines()[-1]
+    assert code == 2 and line.startswith("travjax: ") and err.count("travjax: ") == 1
+    return line.removeprefix("travjax: ")
+
+
+def row(card: str, name: str) -> str:
+    return re.search(rf"^\| {name} \| (.*) \|$", card, re.MULTILINE)[1]
+
+
+def test_the_file_and_its_card_are_written_and_printed(field, tmp_path):
+    to = tmp_path / "my_field.safetensors"
+    assert exported(field, to) == f"{to}\n{to.with_suffix('.md')}\n"
+    assert files(tmp_path) == {to, to.with_suffix(".md")}
+
+
+@pytest.mark.parametrize("which", ["best", "latest"])
+def test_the_file_holds_the_checkpoint_that_is_named(field, tmp_path, which):
+    to = tmp_path / "it.safetensors"
+    exported(field, to, "--checkpoint", which)
+    (run, network, notes), (wanted, trained, meta) = read_model(to), load_estimator(field, which)
+    assert run == wanted
+    require_equal(host(take_apart(network)[1]), host(take_apart(trained)[1]))
+    position = meta["position"]
+    assert notes == {"dataset": dataset().fingerprint, "epoch": position["epoch"], "step": position["total"]}
+    if which == "latest":
+        assert notes["step"] == 10
+
+
+def test_the_best_checkpoint_is_exported_unless_told_otherwise(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors")
+    best = load_meta(field / "checkpoints", "best")["position"]["total"]
+    assert read_model(tmp_path / "it.safetensors")[2]["step"] == best
+
+
+def test_the_file_predicts_as_the_run_does(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors")
+    one, other = (
+        Predictor.load(source).predict(dataset().heights[:2]) for source in (field, tmp_path / "it.safetensors")
+    )
+    np.testing.assert_array_equal(one.probability, other.probability)
+    np.testing.assert_array_equal(one.margins, other.margins)
+
+
+def test_the_card_says_what_it_was_trained_on(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors", "--checkpoint", "latest")
+    card = (tmp_path / "it.md").read_text()
+    assert card.startswith("# it.safetensors\n")
+    count = sum(leaf.size for leaf in jax.tree.leaves(take_apart(load_estimator(field)[1])[1]))
+    assert row(card, "estimator") == f"field, {count:,} parameters" and CONFIG.hidden == 8
+    assert row(card, "robot").startswith("Husky A200; ")
+    assert row(card, "maps") == f"4 x 4 m at 0.125 m, {len(FEW)} trajectories"
+    wanted = f"30 synthetic maps of seed 5 (fingerprint {dataset().fingerprint}), seed 0, 10 steps"
+    assert row(card, "trained on") == wanted
+    assert row(card, "corrupted").startswith("50% of the maps: noise up to 0.02 m")
+    assert "not evaluated: `travjax evaluate` writes the tables" in card
+
+
+def test_the_card_holds_the_tables_of_the_evaluation(field, tmp_path):
+    folder = copy(field, tmp_path / "run")
+    (folder / "evaluation").mkdir()
+    (folder / "evaluation/tables.txt").write_text("F1 of everything\n0.5\n")
+    exported(folder, tmp_path / "it.safetensors")
+    card = (tmp_path / "it.md").read_text()
+    assert "```\nF1 of everything\n0.5\n```" in card and "not evaluated" not in card
+
+
+def test_a_resnet_is_exported_too(trained, tmp_path):
+    exported(trained, tmp_path / "it.safetensors", "--checkpoint", "heads")
+    run, network, notes = read_model(tmp_path / "it.safetensors")
+    assert run.preset.model == "resnet50" and notes["step"] == 14
+    require_equal(host(take_apart(network)[1]), host(take_apart(load_estimator(trained, "heads")[1])[1]))
+    assert row((tmp_path / "it.md").read_text(), "estimator").startswith("resnet50, ")
+
+
+# ---- Bad input
+
+
+def test_another_kind_of_file_is_one_line(field, tmp_path):
+    said = refusal(field, "--to", tmp_path / "it.npz")
+    assert said == f"--to {tmp_path / 'it.npz'}: must be a .safetensors file"
+    assert files(tmp_path) == set()
+
+
+def test_what_is_no_run_is_one_line(tmp_path):
+    said = refusal(tmp_path / "none", "--to", tmp_path / "it.safetensors")
+    assert said.startswith(f"{tmp_path / 'none/run.json'}: cannot be read: No such file or directory")
+    assert files(tmp_path) == set()
+
+
+def test_a_checkpoint_that_is_not_there_is_one_line(field, tmp_path):
+    said = refusal(field, "--to", tmp_path / "it.safetensors", "--checkpoint", "heads")
+    assert "holds no checkpoint 'heads'; it holds: " in said
+    assert files(tmp_path) == set()
+
+
+def test_a_folder_that_is_not_there_is_one_line(field, tmp_path):
+    to = tmp_path / "none/it.safetensors"
+    assert refusal(field, "--to", to).startswith(f"{to}: cannot be written: No such file or directory")
+    assert files(tmp_path) == set()

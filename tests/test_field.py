@@ -49,8 +49,9 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
     logits, margins = map(np.asarray, made(elevation, source.stencil))
     channels = np.asarray(made.trunk(elevation, False), np.float64).reshape(2, -1, CONFIG.channels)
     heads = made.heads
+    exact = lambda layer: [np.asarray(v[...], np.float64) for v in (layer.kernel, layer.bias)]
     first, bias = np.asarray(heads.first.kernel[...], np.float64), np.asarray(heads.bias[...], np.float64)
-    second, hazard = ([np.asarray(v[...], np.float64) for v in (x.kernel, x.bias)] for x in (heads.second, heads.hazard))
+    second, hazard = exact(heads.second), exact(heads.hazard)
     for trajectory in range(len(FEW)):
         _, one, two = FEW.split(trajectory)
         poses, own = FEW.poses(trajectory), len(FEW.first_stations())
@@ -114,7 +115,9 @@ def test_gradients_reach_every_parameter():
 
     def total(parameters):
         made = put_together(graph, variables | parameters)
-        return sum((part * w).sum() for part, w in zip(made(elevation, source.stencil, train=True), weights, strict=True))
+        return sum(
+            (part * w).sum() for part, w in zip(made(elevation, source.stencil, train=True), weights, strict=True)
+        )
 
     gradients = jax.jit(jax.grad(total))({name: variables[name] for name in ("trunk", "heads")})
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):

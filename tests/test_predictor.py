@@ -2,13 +2,16 @@
 
 from dataclasses import replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-import travjax
 from commandline import FEW
 from field_runs import RUN, begun, estimator
-from training import GRID, HUSKY, dataset
+from training import GRID, HUSKY, dataset, run_of
+from training import estimator as resnet
 
+import travjax
 from travjax import metrics
 from travjax.actions import ActionSpace
 from travjax.config import InputError
@@ -76,7 +79,9 @@ def test_what_is_no_estimator_is_refused(tmp_path):
     for name in ("x.npz", "none"):
         assert refusal(Predictor.load, tmp_path / name) == f"{tmp_path / name}: {allowed}"
     assert refusal(Predictor.load, tmp_path).startswith(f"{tmp_path / 'run.json'}: cannot be read")
-    assert refusal(predict, np.zeros((129, 129)), tmp_path / "y.safetensors").startswith(f"{tmp_path}/y.safetensors: no")
+    assert refusal(predict, np.zeros((129, 129)), tmp_path / "y.safetensors").startswith(
+        f"{tmp_path}/y.safetensors: no"
+    )
 
 
 def test_a_folder_without_such_a_checkpoint_is_refused(field):
@@ -96,16 +101,18 @@ def test_probabilities_are_those_of_the_evaluation(field):
     np.testing.assert_allclose(found[place, samples[1]], evaluator.probabilities(network, samples), atol=1e-6)
 
 
-def test_a_resnet_predicts_what_the_evaluation_says(trained):
-    run, network, _ = load_estimator(trained)
-    evaluator = Evaluator.of(run, dataset(), Devices.all())
-    maps, counts = dataset().maps_of("test")[:2], []
-    predictor = Predictor.load(trained)
+def test_a_resnet_predicts_what_the_evaluation_says():
+    predictor, counts, maps = Predictor(run_of(), resnet()), [], dataset().maps_of("test")[:2]
     found = predictor.predict(dataset().heights[maps], counts.append)
+    wanted = Evaluator.of(run_of(), dataset(), Devices.all()).whole_maps(resnet(), maps)
+    np.testing.assert_allclose(found.probability, wanted, atol=1e-5)
     assert found.margins is None and not is_field(predictor) and sum(counts) == 2 * len(FEW)
-    np.testing.assert_allclose(found.probability, evaluator.whole_maps(network, maps), atol=1e-5)
     one = predictor.predict(dataset().heights[maps[1]]).probability
     np.testing.assert_allclose(one, found.probability[1], atol=1e-5)
+
+
+def test_a_resnet_is_loaded_from_its_run(trained):
+    assert Predictor.load(trained).run == Run.load(trained) and not is_field(Predictor.load(trained))
 
 
 def test_probabilities_and_margins_are_the_network_s(tiny):
@@ -117,6 +124,7 @@ def test_probabilities_and_margins_are_the_network_s(tiny):
     np.testing.assert_allclose(found.margins, hazards[..., 3:] * HUSKY.limits, atol=1e-5)
     assert found.probability.shape == found.margins.shape == (6, len(FEW), 3)
     assert found.probability.std(axis=(0, 1)).min() > 1e-4
+    assert not isinstance(found.probability, jax.Array) and not isinstance(found.margins, jax.Array)
 
 
 def test_a_map_alone_and_one_of_many_are_the_same(tiny):
@@ -143,8 +151,6 @@ def test_a_site_at_2000_m_loses_nothing(tiny):
 
 
 def test_heights_may_be_a_jax_array_or_a_list_of_rows(tiny):
-    import jax.numpy as jnp
-
     wanted = tiny.predict(dataset().heights[0]).probability
     for heights in (jnp.asarray(dataset().heights[0]), dataset().heights[0].tolist()):
         np.testing.assert_allclose(tiny.predict(heights).probability, wanted, atol=1e-5)
@@ -203,7 +209,8 @@ def test_another_action_space_or_grid_is_refused_with_both_named(tiny):
     said = refusal(tiny.require_same, actions=ActionSpace())
     assert said.startswith("actions = ActionSpace(turns=18, ") and f"must be {FEW}, which the estimator" in said
     said = refusal(tiny.require_same, grid=replace(GRID, size=8))
-    assert said == "grid = Grid(size=8, spacing=0.125): must be Grid(size=4, spacing=0.125), which the estimator was trained for"  # noqa: E501
+    allowed = "Grid(size=4, spacing=0.125), which the estimator was trained for"
+    assert said == f"grid = Grid(size=8, spacing=0.125): must be {allowed}"
 
 
 def test_its_own_robot_and_actions_are_taken(tiny):

@@ -8,13 +8,40 @@ import numpy as np
 import pytest
 from training import PRESET, TOML
 
+from travjax.actions import ActionSpace
 from travjax.config import InputError, from_json, to_json
+from travjax.corruption import CorruptionConfig
 from travjax.dataset import DatasetConfig
 from travjax.estimator import HeadsConfig
+from travjax.field import FieldConfig
 from travjax.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.resnet import ResNetConfig
 
 EXPERIMENTS = sorted((Path(__file__).parents[1] / "experiments/train").glob("*.toml"))
+FIELDS = sorted((Path(__file__).parents[1] / "experiments/field").glob("*.toml"))
+
+FIELD_TOML = """
+model = "field"
+weights = "none"
+[field]
+stem = 4
+widths = [4, 8, 16]
+channels = 3
+hidden = 8
+margin_weight = 2
+momentum = 0.9
+dtype = "bfloat16"
+[corruption]
+share = 0.5
+noise = 0.1
+missing = 0.3
+coarse = 0.4
+[training]
+method = "adamw"
+head_epochs = 0
+clip = 0.5
+weight_decay = 1e-4
+"""
 
 
 def written(folder: Path, text: str) -> Path:
@@ -38,9 +65,21 @@ def test_a_file_gives_every_table_by_name(tmp_path):
     assert Preset.load(written(tmp_path, TOML)) == PRESET
 
 
+def test_a_file_of_the_hazard_field_gives_its_tables(tmp_path):
+    preset = Preset.load(written(tmp_path, FIELD_TOML))
+    assert preset.model == "field"
+    assert preset.field == FieldConfig(4, (4, 8, 16), 3, 8, 2, momentum=0.9, dtype="bfloat16")
+    assert preset.corruption == CorruptionConfig(0.5, 0.1, 0.3, 0.4)
+    training = preset.training
+    assert (training.method, training.clip, training.head_epochs) == ("adamw", 0.5, 0)
+    assert from_json(to_json(preset), Preset) == preset
+
+
 def test_what_is_left_out_is_the_paper(tmp_path):
     preset = Preset.load(written(tmp_path, ""))
     assert preset == Preset()
+    assert (preset.model, preset.training.method, preset.training.clip) == ("resnet50", "rmsprop", 0)
+    assert preset.corruption.share == 0
     assert preset.dataset == DatasetConfig(56_840, 0, 0.08, 0.02)
     assert preset.trunk == ResNetConfig((3, 4, 6, 3), 64, "1x1", momentum=0.99)
     assert preset.heads == HeadsConfig(512, 0.2)
@@ -64,6 +103,21 @@ def test_the_presets_of_the_repository_are_right(path):
     assert preset.trunk.features == 2048
 
 
+@pytest.mark.parametrize("path", FIELDS, ids=lambda path: path.stem)
+def test_the_presets_of_the_hazard_field_are_right(path):
+    preset, arcs = Preset.load(path), ActionSpace().turns * len(ActionSpace().radii)
+    assert (preset.model, preset.robot, preset.weights) == ("field", "seekur_jr", "none")
+    assert preset.training.method == "adamw" and preset.training.schedule == "cosine"
+    assert preset.corruption.share > 0.3
+    assert len(ActionSpace().radii) <= preset.training.each < len(ActionSpace()) == 13 * arcs
+    steps = preset.dataset.split_sizes()[0] / preset.training.batch_size * preset.training.epochs
+    assert steps > 3 * preset.training.warmup_steps
+
+
+def test_both_models_have_the_same_presets():
+    assert [path.stem for path in FIELDS] == [path.stem for path in EXPERIMENTS] == ["laptop", "paper", "smoke"]
+
+
 def test_there_is_a_preset_of_the_paper():
     paper = Preset.load(next(path for path in EXPERIMENTS if path.stem == "paper"))
     assert replace(paper.training, checkpoint_steps=1) == TrainingConfig(checkpoint_steps=1)
@@ -77,7 +131,7 @@ def test_there_is_a_preset_of_the_paper():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("maps = 3", "unknown key 'maps'; allowed: robot, weights, elevation_scale, dataset, trunk, heads, training"),
+        ("maps = 3", "unknown key 'maps'; allowed: model, robot, weights, elevation_scale, dataset, trunk, heads, field"),
         ("[dataset]\nmap = 3", "[dataset] unknown key 'map'; allowed: maps, seed, validation, test"),
         ("[training]\nlearning_rates = 3", "[training] unknown key 'learning_rates'; allowed: seed, batch_size, "),
         ("[evaluations]\nmaps = 3", "unknown key 'evaluations'; allowed: "),
@@ -103,6 +157,14 @@ def test_there_is_a_preset_of_the_paper():
         ("[training]\nweight_decay = -0.1", "[training] weight_decay = -0.1: must be from 0 to 10"),
         ('[training]\nschedule = "step"', "[training] schedule = 'step': must be one of constant, cosine"),
         ("[training]\nfresh = 1", "[training] fresh = 1: must be true or false"),
+        ('[training]\nmethod = "adam"', "[training] method = 'adam': must be one of rmsprop, adamw"),
+        ("[training]\nclip = -1", "[training] clip = -1: must be from 0 to 1000000"),
+        ('model = "unet"', "model = 'unet': must be one of resnet50, field"),
+        ('model = "field"', "[training] head_epochs = 1: must be 0: the hazard field has no frozen trunk"),
+        ("[field]\nwidths = []", "[field] widths = (): must be 1 to 6 whole numbers from 1 to 1024"),
+        ("[field]\nwidth = 3", "[field] unknown key 'width'; allowed: stem, widths, channels, hidden"),
+        ("[corruption]\nshare = 2", "[corruption] share = 2: must be a share from 0 to 1"),
+        ("[corruption]\nmissing = 1", "[corruption] missing = 1: must be a share from 0 to 0.9"),
         ("[training]\nepochs = 0\nhead_epochs = 0", "[training] epochs = 0: must be at least 1 where head_epochs is 0"),
     ],
 )
@@ -163,6 +225,33 @@ def test_the_optimizer_is_rmsprop_with_epsilon_outside_of_the_root():
         np.testing.assert_allclose(moved, -rate * gradient / (np.sqrt(nu) + 1e-3), rtol=1e-5)
 
 
+def test_adamw_is_that_of_numpy_and_leaves_the_loss_alone():
+    """Loshchilov and Hutter 2019, algorithm 2, with the usual 0.9, 0.999 and 1e-8."""
+    random, rate, decay = np.random.default_rng(0), 0.013, 0.3
+    config = TrainingConfig(method="adamw", learning_rate=rate, weight_decay=decay)
+    optimizer, value = config.optimizer(2, 10), random.standard_normal(20).astype(np.float32)
+    state, mean, square = optimizer.init(value), np.zeros(20), np.zeros(20)
+    for step in range(1, 5):
+        gradient = (random.standard_normal(20) * 10.0 ** random.uniform(-4, 2, 20)).astype(np.float32)
+        moved, state = optimizer.update(gradient, state, value)
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient.astype(float) ** 2
+        adam = mean / (1 - 0.9**step) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
+        np.testing.assert_allclose(moved, -rate * (adam + decay * value), rtol=1e-4, atol=1e-6)
+    assert config.penalty == 0 and TrainingConfig(weight_decay=decay).penalty == decay
+
+
+def test_long_gradients_are_cut_and_short_ones_are_not():
+    rate = 0.017
+    config = TrainingConfig(learning_rate=rate, decay=0.5, epsilon=1.0, clip=2.0)
+    for length in (0.5, 30.0):
+        gradient = {"a": np.array([0.6 * length], np.float32), "b": np.array([0.8 * length], np.float32)}
+        optimizer = config.optimizer(2, 10)
+        moved, _ = optimizer.update(gradient, optimizer.init(gradient))
+        for name, share in (("a", 0.6), ("b", 0.8)):
+            cut = share * min(length, 2.0)
+            np.testing.assert_allclose(moved[name], -rate * cut / (math.sqrt(0.5) * cut + 1), rtol=1e-5)
+
+
 def test_the_optimizer_follows_the_schedule():
     optimizer = TrainingConfig(learning_rate=0.5, schedule="cosine", warmup_steps=2).optimizer(2, 6)
     state, lengths = optimizer.init(np.ones(1, np.float32)), []
@@ -201,7 +290,7 @@ def test_missing_weights_are_one_line_that_says_what_to_do(tmp_path, monkeypatch
 
 
 def test_every_setting_is_explained():
-    for kind in (TrainingConfig, EvaluationConfig, Preset):
+    for kind in (TrainingConfig, EvaluationConfig, Preset, FieldConfig, CorruptionConfig):
         for field in fields(kind):
             inner = field.name in ("dataset", "trunk", "heads", "training", "evaluation")
             assert inner or field.name in kind.__doc__, field.name

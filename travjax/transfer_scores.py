@@ -191,11 +191,12 @@ def events_table(results: Results, arm: str) -> str:
                     "always": mean_and_spread([always.f1]) if first else "",
                 }
                 rows.append(place | {"state": state} | _figures(counts, ("accuracy", "recall", "precision", "f1")))
+    notes = _undefined(results, rows)
     for event, paper in PAPER_REAL.items():
         place = {"site": "paper: its own" if event == NAMES[0] else "", "event": event, "state": "paper, transferred"}
         place |= {"failures": f"{paper.failures:.2%}", "always": mean_and_spread([always_fails(paper).f1])}
         rows.append(place | _figures([paper], ("accuracy", "recall", "precision", "f1")))
-    notes = [*_undefined(results, rows), "tilt in the paper: no sample fails, so its figures are undefined"]
+    notes = [*notes, "tilt in the paper: no sample fails, so its figures are undefined"]
     return with_notes(rows_table(rows, EVENT_COLUMNS), notes)
 
 
