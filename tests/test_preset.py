@@ -131,7 +131,7 @@ def test_there_is_a_preset_of_the_paper():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("maps = 3", "unknown key 'maps'; allowed: model, robot, weights, elevation_scale, dataset, trunk, heads, field"),
+        ("maps = 3", "unknown key 'maps'; allowed: model, robot, weights, elevation_scale, dataset, trunk, heads"),
         ("[dataset]\nmap = 3", "[dataset] unknown key 'map'; allowed: maps, seed, validation, test"),
         ("[training]\nlearning_rates = 3", "[training] unknown key 'learning_rates'; allowed: seed, batch_size, "),
         ("[evaluations]\nmaps = 3", "unknown key 'evaluations'; allowed: "),
