@@ -294,7 +294,11 @@ def test_weights_that_are_none_are_one_line(tmp_path, words):
     ("line", "other", "message"),
     [
         ("hidden = 16", "hiden = 16", "[heads] unknown key 'hiden'; allowed: hidden, dropout"),
-        ("[heads]", "[head]", "unknown key 'head'; allowed: robot, weights, elevation_scale, dataset, trunk, heads,"),
+        (
+            "[heads]",
+            "[head]",
+            "unknown key 'head'; allowed: model, robot, weights, elevation_scale, dataset, trunk, heads,",
+        ),
         ("batch_size = 8", "batch_size = 0", "[training] batch_size = 0: must be a whole number, at least 1"),
     ],
 )
@@ -307,7 +311,7 @@ def test_a_wrong_preset_is_one_line(tmp_path, words, line, other, message):
 
 def test_a_missing_preset_is_one_line(tmp_path):
     said = refusal(("train", tmp_path / "none.toml", "--out", tmp_path / "run"))
-    assert said == f"{tmp_path / 'none.toml'}: cannot be read: No such file or directory"
+    assert said == f"preset {tmp_path / 'none.toml'}: no such file"
 
 
 def test_a_data_set_of_another_robot_or_action_space_is_one_line(tmp_path, words):

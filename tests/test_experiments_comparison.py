@@ -60,7 +60,8 @@ def test_everything_that_is_written_is_printed(done):
     assert {path.name for path in folder.iterdir()} == names
     assert {line for line in out.splitlines() if line.startswith(str(folder))} == {str(folder / name) for name in names}
     for name in ("robustness.png", "quality.png"):
-        assert Image.open(folder / name).size[0] > 800
+        with Image.open(folder / name) as image:
+            assert image.size[0] > 800
 
 
 def test_the_figures_are_those_of_the_methods(done):

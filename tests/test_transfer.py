@@ -97,7 +97,7 @@ def test_all_arms_and_seeds_train_on_the_same_samples_with_the_same_settings(fro
 def test_features_of_a_frozen_trunk_are_computed_once_for_all_seeds(frozen):
     made, _, computed = frozen
     each = 2 + len(made.held_out)  # training, validation and every held-out site
-    assert computed == ["sample_features"] * (each * len(ARMS))
+    assert computed == ["features"] * (each * len(ARMS))
     assert len(list((made.folder / "features").iterdir())) == len(ARMS)
 
 

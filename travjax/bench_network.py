@@ -101,7 +101,7 @@ class Bench:
                 graph=self.graph,
                 phase=2,
                 optimizer=optimizer,
-                weight_decay=0.001,
+                penalty=0.001,
             )
             return loss
 

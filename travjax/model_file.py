@@ -32,7 +32,7 @@ def read_model(path: Path) -> tuple[Run, Network, dict]:
         run, notes = Run.from_json(described["run"]), described["notes"]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    except (LookupError, TypeError, ValueError):
+    except (LookupError, TypeError, ValueError, AttributeError):
         raise InputError(f"{path}: holds no estimator of travjax; allowed: a file of `travjax export`") from None
     template = run.template(0)
     expected = {name: (leaf.shape, leaf.dtype) for name, leaf in _named(template).items()}

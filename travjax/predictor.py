@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -74,7 +73,8 @@ class Predictor:
     def predict(self, heights: Heights, on_progress: Callable[[int], object] = lambda count: None) -> Predicted:
         """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid.
 
-        An unknown node counts as the nearest known one. on_progress: is told how many trajectories were added
+        An unknown node counts as the nearest known one to the hazard field, and as in SPEC section 6 to the ResNet.
+        on_progress: is told how many trajectories were added
         Raises InputError when heights have another shape or are no numbers.
         """
         maps, devices = np.asarray(as_maps(heights, self.run.grid)), Devices.all()
@@ -91,7 +91,7 @@ class Predictor:
             size = 64 * devices.mesh.size
             logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
             logits = logits.reshape(len(maps), trajectories, -1)
-        one = (lambda array: array[0]) if jnp.ndim(heights) == 2 else (lambda array: array)
+        one = (lambda array: array[0]) if np.ndim(heights) == 2 else (lambda array: array)
         return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from travjax.commands import options
 from travjax.config import InputError
 from travjax.files import written_whole
+from travjax.models import FIELD
 
 
 def add(commands: options.Commands) -> None:
@@ -48,6 +49,11 @@ def _card(folder: Path, trained, notes: dict, name: str) -> str:
     grid, actions, seen = trained.grid, trained.actions, preset.corruption
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
     measured = tables.read_text().strip() if tables.exists() else "not evaluated: `travjax evaluate` writes the tables"
+    field = preset.model == FIELD
+    corrupted = (
+        f"| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
+    )
+    margins = "Regressed margins are not told apart above four times a limit. "
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"
     return f"""# {name}
 
@@ -59,8 +65,7 @@ Predicts which trajectories of a wheeled robot fail on an elevation map, and by 
 | robot | {trained.robot.name}; another one needs training: `travjax train PRESET --robot FILE` |
 | maps | {grid.size:g} x {grid.size:g} m at {grid.spacing:g} m, {len(actions)} trajectories |
 | trained on | {data} (fingerprint {notes["dataset"]}), seed {preset.training.seed}, {notes["step"]:,} steps |
-| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |
-
+{corrupted * field}
 ## Evaluation
 
 ```
@@ -68,5 +73,5 @@ Predicts which trajectories of a wheeled robot fail on an elevation map, and by 
 ```
 
 Limits: labels are those of a kinematic simulator on synthetic terrain, without friction, dynamics or soft ground.
-Regressed margins are not told apart above four times a limit. Do not let it drive a robot unwatched.
+{margins * field}Do not let it drive a robot unwatched.
 """
