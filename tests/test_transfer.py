@@ -3,8 +3,10 @@
 import math
 from dataclasses import replace
 
+import field_runs
 import numpy as np
 import pytest
+from field_runs import begun
 from training import HUSKY, PRESET, dataset, differing, require_equal, rows_of, saved_state
 
 from travjax import metrics, train, transfer
@@ -15,7 +17,7 @@ from travjax.preset import TrainingConfig
 from travjax.robot import Robot
 from travjax.sampling import every_sample, natural_sample
 from travjax.trained import Run
-from travjax.transfer import ARMS, IMAGENET, SCRATCH, SYNTHETIC, Transfer, TransferConfig, run_all
+from travjax.transfer import ARMS, FIELD_ARMS, IMAGENET, SCRATCH, SYNTHETIC, Transfer, TransferConfig, run_all
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -236,3 +238,21 @@ def test_figures_of_another_data_set_or_model_are_not_taken_for_ones_of_this(fro
     with pytest.raises(InputError, match=f"weights = '{elsewhere}': must be {trained}, as in the run so far"):
         moved.rows(SYNTHETIC, 0)
     assert len(moved.rows(SCRATCH, 0)) == 3
+
+
+def test_the_hazard_field_begins_with_random_weights_and_with_the_synthetic_model(real, tmp_path):
+    begun(tmp_path / "synthetic").train()
+    training = replace(field_runs.PRESET.training, epochs=1)
+    config = replace(FROZEN, seeds=(0,), each=0, training=training)
+    base = Run.load(tmp_path / "synthetic")
+    made = Transfer(config, base, tmp_path / "synthetic", real, tmp_path / "out", Devices.all())
+    rows = run_all(made, lambda arm, seed: None)
+    assert list(rows) == list(FIELD_ARMS)
+    assert all([row["epoch"] for row in rows[arm][0]] == [0, 1] for arm in FIELD_ARMS)
+    evaluator = Evaluator.of(base, real, Devices.all())
+    for site, samples in made.held_out.items():
+        found = metrics.evaluate(evaluator.probabilities(made.pretrained, samples), evaluator.failed(samples))
+        counts = rows["synthetic"][0][0]["watched"][site]["overall"]["confusion"]
+        assert counts["tp"] == found.scores["overall"].confusion.tp
+    first = [saved_state(made.place_of(arm, 0)) for arm in FIELD_ARMS]
+    assert differing(*first)
