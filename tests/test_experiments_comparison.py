@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,15 @@ from field_runs import RUN, estimator
 from PIL import Image
 from training import GRID, HUSKY
 
+from travjax import curves
+from travjax.dataset import DatasetConfig
 from travjax.experiments import comparison
 from travjax.model_file import write_model
 from travjax.predictor import Predictor
-from travjax.robustness import CORRUPTIONS, Ground
+from travjax.preset import Preset
+from travjax.robustness import CORRUPTIONS, FILTERS, Ground, score
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
 
@@ -84,6 +90,64 @@ def test_the_figures_are_those_of_the_methods(done):
     np.testing.assert_allclose(list(maps["none"]["margin_errors"].values()), errors, rtol=1e-4)
 
 
+def test_the_filter_is_the_best_on_validation_maps(done):
+    maps = json.loads((done[0] / "results.json").read_text())["maps"]
+    validation = Ground.synthetic(5, comparison.SEED + 1, HUSKY, FEW, GRID)
+    for name in CORRUPTIONS:
+        seen = validation.seen(name, comparison.SEED + 1)
+        f1 = {key: score(validation.simulated(smooth(seen)), validation.failed).f1 for key, smooth in FILTERS.items()}
+        assert f1[maps[name]["filter"]] == max(f1.values())
+
+
+def test_the_report_says_what_the_scores_are_of(done):
+    report = (done[0] / "report.md").read_text()
+    maps = "6 test maps and 5 validation maps that no preset trains on"
+    assert f"{maps}, 18 trajectories each, seed {comparison.SEED};" in report
+    assert "The ResNet50's scores are of 20 random trajectories, the others' of all." in report
+
+
+def test_maps_are_those_of_no_preset():
+    presets = [Preset.load(path) for folder in ("field", "train") for path in EXPERIMENTS.glob(f"{folder}/*.toml")]
+    sets = [DatasetConfig(200, comparison.SEED), DatasetConfig(50, comparison.SEED + 1)]
+    ours, others = (
+        [set(zip(config.styles().tolist(), config.seeds().tolist(), strict=True)) for config in configs]
+        for configs in (sets, [preset.dataset for preset in presets])
+    )
+    assert len(presets) >= 6 and not ours[0] & ours[1]
+    assert not any(one & other for one in ours for other in others)
+
+
+def test_another_seed_gives_other_maps_and_the_same_one_the_same_results():
+    network = Predictor(RUN, estimator())
+    found = []
+    for seed in (1, 1, 2):
+        test, validation = (Ground.synthetic(5, seed + number, HUSKY, FEW, GRID) for number in (0, 1))
+        found.append(comparison.compare(test, validation, network, None, 5, seed))
+    assert found[0] == found[1] != found[2]
+
+
+def test_the_quality_figure_draws_the_simulator_after_its_filter():
+    noise = "noise 5 cm"
+    f1 = {comparison.SIMULATOR: {"none": 1.0, noise: 0.2}, comparison.FILTERED: {"none": 1.0, noise: 0.8}}
+    f1[comparison.HAZARD] = {"none": 0.9, noise: 0.85}
+    seconds = {"sequential simulator": 3.0, "network, float32, batches of 64": 30.0, "hazard field, 1 map": 0.05}
+    points = comparison._points(f1, seconds)
+    assert points == {"sequential simulator": (3.0, 1.0, 0.8), "hazard field, 1 map": (0.05, 0.9, 0.85)}
+    (ax,) = curves.quality_figure(points).axes
+    assert ax.get_xscale() == "log"
+    drawn = {(*line.get_xdata(), *line.get_ydata()) for line in ax.lines if line.get_marker() in "ov"}
+    assert {(3.0, 1.0), (3.0, 0.8), (0.05, 0.9), (0.05, 0.85)} <= drawn
+
+
+def test_the_robustness_figure_draws_every_f1():
+    f1 = {method: {name: (1 + n) / 10 + m / 100 for n, name in enumerate(CORRUPTIONS)} for m, method in enumerate("ab")}
+    left, right = curves.robustness_figure(f1).axes
+    assert list(left.lines[1].get_xdata()) == [0, 1, 2, 5]
+    assert list(left.lines[1].get_ydata()) == [f1["b"][name] for name in list(CORRUPTIONS)[:4]]
+    heights = [bar.get_height() for bar in right.patches]
+    assert heights == [of[name] for of in f1.values() for name in ("none", "5% missing", "20% missing", "0.125 m")]
+
+
 def test_the_times_are_of_every_way(done):
     times = json.loads((done[0] / "results.json").read_text())["times"]
     starts = ["sequential", "batched", "batched", "network", "hazard field, 1 map", "hazard field, 8 maps"]
@@ -97,6 +161,8 @@ def test_an_estimator_of_another_model_is_refused(trained, model, tmp_path):
         (("--field", trained), "--field = "),
         (("--field", model, "--resnet", model), "--resnet = "),
         (("--field", model, "--maps", 0), "--maps = 0: must be at least 1"),
+        (("--field", model, "--seed", -1), "--seed = -1: must be a whole number from 0"),
+        (("--field", tmp_path / "none.safetensors"), f"{tmp_path}/none.safetensors: "),
     ):
         code, _, err = run(*words, "--out", tmp_path / "out")
         assert code == 2 and err.startswith(f"travjax: {message}") and err.count("\n") == 1

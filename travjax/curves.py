@@ -236,18 +236,20 @@ def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
 
     points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
     """
-    figure = Figure(figsize=(9, 4.8), layout="constrained")
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
     ax = figure.subplots()
     for number, (name, (seconds, clean, noisy)) in enumerate(points.items()):
         ax.plot([seconds, seconds], [clean, noisy], "-", color=f"C{number}", alpha=0.4)
         ax.plot(seconds, clean, "o", color=f"C{number}", label=f"{name}: {seconds:.3g} s")
         ax.plot(seconds, noisy, "v", color=f"C{number}")
+    for marker, label in (("o", "clean map"), ("v", "at the largest noise, simulators after the best filter")):
+        ax.plot([], [], marker, color="0.4", label=label)
     ax.set_xscale("log")
     ax.set(
         xlabel="s for all trajectories of a map",
-        ylabel=f"F1 at {THRESHOLD:g}: o clean, v at 5 cm of noise",
+        ylabel=f"F1 at {THRESHOLD:g}, events pooled",
         ylim=(0, 1.05),
     )
     ax.grid(alpha=0.3)
-    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return figure
