@@ -22,7 +22,7 @@ from travjax.map_data import MapSource
 from travjax.model_file import write_model
 from travjax.parallel import Devices
 from travjax.prediction import map_hazards
-from travjax.predictor import DEFAULT, WEIGHTS, Predictor, is_field, predict
+from travjax.predictor import DEFAULT, WEIGHTS, Predictor, predict
 from travjax.robot import Robot
 from travjax.sampling import every_sample
 from travjax.terrain import STYLES, generate_terrain
@@ -59,7 +59,7 @@ def test_a_run_s_folder_gives_its_estimators(field):
     heights = dataset().heights[:2]
     for which in ("best", "latest"):
         predictor, (run, network, _) = Predictor.load(field, which), load_estimator(field, which)
-        assert predictor.run == run and is_field(predictor)
+        assert predictor.run == run and predictor.run.preset.model == "field"
         np.testing.assert_array_equal(
             predictor.predict(heights).probability, Predictor(run, network).predict(heights).probability
         )
@@ -106,13 +106,13 @@ def test_a_resnet_predicts_what_the_evaluation_says():
     found = predictor.predict(dataset().heights[maps], counts.append)
     wanted = Evaluator.of(run_of(), dataset(), Devices.all()).whole_maps(resnet(), maps)
     np.testing.assert_allclose(found.probability, wanted, atol=1e-5)
-    assert found.margins is None and not is_field(predictor) and sum(counts) == 2 * len(FEW)
+    assert found.margins is None and predictor.run.preset.model == "resnet50" and sum(counts) == 2 * len(FEW)
     one = predictor.predict(dataset().heights[maps[1]]).probability
     np.testing.assert_allclose(one, found.probability[1], atol=1e-5)
 
 
 def test_a_resnet_is_loaded_from_its_run(trained):
-    assert Predictor.load(trained).run == Run.load(trained) and not is_field(Predictor.load(trained))
+    assert Predictor.load(trained).run == Run.load(trained) and Predictor.load(trained).run.preset.model == "resnet50"
 
 
 def test_probabilities_and_margins_are_the_network_s(tiny):
@@ -229,7 +229,7 @@ def packaged() -> Predictor:
 def test_the_packaged_estimator_is_for_the_seekur_jr_and_the_paper_s_actions(packaged):
     run = packaged.run
     wanted = Run(run.preset, Robot.load("seekur_jr"), ActionSpace(), travjax.Grid())
-    assert run == wanted and is_field(packaged)
+    assert run == wanted and run.preset.model == "field"
     assert (WEIGHTS / f"{DEFAULT}.safetensors").stat().st_size <= 15e6
     assert (WEIGHTS / f"{DEFAULT}.md").read_text().startswith(f"# {DEFAULT}.safetensors\n")
 

@@ -74,9 +74,11 @@ def upsampled(maps: Maps) -> Maps:
 
 def filled(maps: Maps) -> Maps:
     """With the height of the nearest known node where NaN; a map without any known node is flat."""
+    holes = np.isnan(maps)
+    if not holes.any():
+        return maps
     result = np.array(maps)
-    for one in result:
-        unknown = np.isnan(one)
+    for one, unknown in zip(result, holes, strict=True):
         if unknown.all():
             one[:] = 0
         elif unknown.any():

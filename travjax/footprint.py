@@ -181,14 +181,15 @@ def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.nd
         poses = _poses(actions, true_turn, true_first, view.second(np.arange(len(actions.radii)), actions))
         x, y, heading = (poses[..., axis, None] for axis in range(3))
         sin, cos, aside = np.sin(heading), np.cos(heading), -right if view.mirrored else right
-        col = _nearest(x + cos * aside - sin * forward, grid)
-        row = _nearest(y + sin * aside + cos * forward, grid)
+        col = nearest(x + cos * aside - sin * forward, grid)
+        row = nearest(y + sin * aside + cos * forward, grid)
         _check_inside(row, col, grid, actions.arc_lengths)
         nodes.append(row * grid.nodes + col)
     return np.stack(nodes, axis=-1).astype(np.int32)
 
 
-def _nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
+def nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
+    """Row or column of the node nearest to a y or x [m], also where it lies off the map; ties go to +y, +x."""
     return np.floor(coordinate / grid.spacing + grid.cells / 2 + 0.5 + TIE).astype(int)
 
 

@@ -42,8 +42,7 @@ class MapSource:
     @staticmethod
     def of(heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float) -> "MapSource":
         """heights: [n, rows, cols] metres; an unknown node gets the height of the nearest known one."""
-        known = heights if not np.isnan(heights).any() else filled(heights)
-        return MapSource(known, stencil(robot, actions, grid), np.float32(elevation_scale))
+        return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
 
     def elevation(self, map_index: Int[Array, " b"]) -> Float[Array, "b rows cols"]:
         """What the network sees of maps."""
@@ -105,7 +104,7 @@ class MapData:
         trajectories = (arcs[:, None] * table.second_arcs + np.arange(table.second_arcs)).ravel()
         targets = _targets(margins.events(), view.trajectories(data.actions)[trajectories], data.robot.limits)
         seen = np.flip(heights, tuple(axis + 1 for axis in view.flipped))
-        seen = corrupted(filled(seen) if np.isnan(seen).any() else seen, preset.corruption, rng)
+        seen = corrupted(filled(seen), preset.corruption, rng)
         part = Stencil(table.nodes[arcs], table.first_poses, table.second_arcs)
         return (relative(seen, np.float32(preset.elevation_scale)), part), targets
 

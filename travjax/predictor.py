@@ -13,7 +13,6 @@ from travjax.estimator import take_apart
 from travjax.grid import Grid
 from travjax.map_data import MapSource
 from travjax.model_file import SUFFIX, read_model
-from travjax.models import FIELD
 from travjax.parallel import Devices
 from travjax.prediction import hazards, logits_of, probabilities
 from travjax.robot import Robot
@@ -104,8 +103,3 @@ def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarr
     Returns [n, t, 3], or [t, 3] for one map. Raises InputError for heights or a model that cannot be.
     """
     return Predictor.load(model).predict(heights).probability
-
-
-def is_field(predictor: Predictor) -> bool:
-    """Whether it reads all trajectories of a map at once."""
-    return predictor.run.preset.model == FIELD

@@ -3,7 +3,7 @@
 A method turns maps [n, rows, cols] into scores of failure [n, t, 3], of which 0.5 and more says "fails".
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -143,6 +143,6 @@ def scores(fails: Fails, failed: Bool[np.ndarray, "*k 3"], threshold: float = 0.
 
 def average_precisions(fails: Fails, failed: Bool[np.ndarray, "*k 3"]) -> dict[str, float]:
     """Of each event, and of all pooled."""
-    pairs: Mapping[str, tuple] = {name: (fails[..., e], failed[..., e]) for e, name in enumerate(EVENTS)}
-    pairs = dict(pairs) | {OVERALL: (fails, failed)}
-    return {name: average_precision(pairs[name][0].ravel(), pairs[name][1].ravel()) for name in NAMES}
+    columns = [(fails[..., event], failed[..., event]) for event in range(len(EVENTS))]
+    pairs = zip(NAMES, [*columns, (fails, failed)], strict=True)
+    return {name: average_precision(one.ravel(), true.ravel()) for name, (one, true) in pairs}

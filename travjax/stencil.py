@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Int
 
 from travjax.actions import ActionSpace, arc_poses
-from travjax.footprint import node_table
+from travjax.footprint import nearest, node_table
 from travjax.grid import Grid
 from travjax.robot import Robot
 
@@ -68,14 +68,14 @@ def nodes_at(poses: np.ndarray, radius: np.ndarray, robot: Robot, actions: Actio
     right = robot.chassis_width * (np.arange(ACROSS) + 0.5 - ACROSS / 2) / ACROSS
     forward = robot.chassis_length * (np.arange(ALONG) + 0.5 - ALONG / 2) / ALONG
     chassis = np.stack(np.meshgrid(right, forward, indexing="ij"), axis=-1).reshape(-1, 2)
-    places = [_nearest(poses, wheels, grid), _nearest(before, wheels, grid), _nearest(poses, chassis, grid)]
+    places = [_nodes(poses, wheels, grid), _nodes(before, wheels, grid), _nodes(poses, chassis, grid)]
     return np.concatenate(places, axis=-1)
 
 
-def _nearest(poses: np.ndarray, places: np.ndarray, grid: Grid) -> np.ndarray:
+def _nodes(poses: np.ndarray, places: np.ndarray, grid: Grid) -> np.ndarray:
     """Nodes nearest to places [k, 2] (right, forward) of the robot at poses [..., 3]: [..., k]."""
     x, y, heading = (poses[..., axis, None] for axis in range(3))
     sin, cos, (right, forward) = np.sin(heading), np.cos(heading), places.T
-    node = lambda c: np.clip(np.floor(c / grid.spacing + grid.cells / 2 + 0.5 + 1e-9).astype(int), 0, grid.cells)
+    node = lambda coordinate: np.clip(nearest(coordinate, grid), 0, grid.cells)
     row, col = node(y + sin * right + cos * forward), node(x + cos * right - sin * forward)
     return (row * grid.nodes + col).astype(np.int32)
