@@ -21,6 +21,8 @@ ORDER = [
     "traverse",
     "reference",
     "inputs",
+    "coordinates",
+    "dem_options",
     "raster",
     "clouds",
     "dem",

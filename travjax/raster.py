@@ -32,12 +32,14 @@ class Raster:
     cell_size: metres between neighbouring values
     origin:    x, y of heights[0, 0], the south-west value
     crs:       coordinate system as the file names it, or None
+    notes:     lines about how the file was read that its user should know
     """
 
     heights: np.ndarray
     cell_size: float
     origin: tuple[float, float] = (0.0, 0.0)
     crs: str | None = None
+    notes: tuple[str, ...] = ()
 
 
 def require_heights(known: np.ndarray) -> None:
