@@ -19,9 +19,7 @@ from travjax.raster import (
     COARSEST,
     Raster,
     agreed_cell_size,
-    crs_name,
     require_heights,
-    require_metric,
     require_size,
 )
 
@@ -61,17 +59,16 @@ class Points(NamedTuple):
     crs: Any = None
 
 
-def read_cloud(path: Path, cell_size: float | None, scale: float | None, nodata: float | None, grid: Grid) -> Raster:
+def read_cloud(path: Path, form: str, options, grid: Grid) -> Raster:
     """The points of a file as a raster; cell_size, scale (height_scale) and nodata as `load_dem` takes them.
 
     Points whose z is NaN or nodata are left out. Raises InputError when the file cannot be read or is cut short, its
     coordinates are not finite, in degrees or feet, or in too large steps, and when the points are too few, or too far
     apart for a raster.
     """
-    suffix = path.suffix.lower()
-    read = _read_text if suffix in TEXT else _read_ply if suffix == ".ply" else _read_las
+    cell_size, scale, nodata = options.cell_size, options.height_scale, options.nodata
+    read = {"text": _read_text, "ply": _read_ply, "las": _read_las}[form]
     x, y, z, crs = read(path)
-    require_metric(crs, scale is not None)
     _require_fine_steps(x, y)
     z = z.astype(np.float64)
     known = ~np.isnan(z)
@@ -88,7 +85,7 @@ def read_cloud(path: Path, cell_size: float | None, scale: float | None, nodata:
     fewest = int(grid.size / max(raster.cell_size, COARSEST)) ** 2
     if len(z) < fewest:
         raise InputError(f"points = {len(z)}: must be at least {fewest}, as many as a window has cells")
-    return Raster(raster.heights, raster.cell_size, raster.origin, crs_name(crs))
+    return Raster(raster.heights, raster.cell_size, raster.origin, None)
 
 
 def _require_fine_steps(x: np.ndarray, y: np.ndarray) -> None:

@@ -103,6 +103,27 @@ def require_metric(crs: CRS | None, x: float, y: float, heights_scaled: bool) ->
         _require_true_to_scale(name, ground, x, y)
 
 
+def require_metric_named(name: str | None, x: float, y: float, heights_scaled: bool) -> None:
+    """Raises InputError unless the system of that code or text is as `require_metric` wants it.
+
+    The text of a local system may be of any kind: it says nothing but that it is one.
+    """
+    if name is not None and not (is_local(name) and _is_vague(name)):
+        require_metric(parsed(name), x, y, heights_scaled)
+
+
+def is_local(name: str | None) -> bool:
+    """Whether a system, as it is named, says nothing about where on earth it lies."""
+    return name is None or name.startswith(("LOCAL_CS", "ENGCRS"))
+
+
+def _is_vague(name: str) -> bool:
+    try:
+        return not parsed(name)
+    except InputError:
+        return True
+
+
 def require_height_unit(where: str, unit: str, metres: float, heights_scaled: bool) -> None:
     """Raises InputError for heights in another unit than metres, unless a height scale was given."""
     if abs(metres - 1) > 1e-9 and unit.lower() != "unknown" and not heights_scaled:

@@ -1,60 +1,98 @@
-"""Real elevation maps: read a DEM, fill small holes, resample, cut into windows (SPEC section 11).
+"""Real elevation maps: read a file, fill small holes, resample, cut into windows (SPEC section 11).
 
 Files are brought to one convention: row 0 is the southernmost, column 0 the westernmost, a value stands at its pixel's
-centre. GeoTIFF and whatever else rasterio reads run from north to south and are flipped; .npy and .npz are as grid.py;
-of points, x is east and y is north.
+centre. Rasters that GDAL reads say themselves how they run; .npy and .npz are as grid.py; of points, x is east and y is
+north. What a file is, its content says.
 """
 
-import warnings
-import zipfile
-import zlib
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from travjax.clouds import SUFFIXES, read_cloud
+from travjax.array_files import rasters_of, read_npy, read_npz
+from travjax.clouds import read_cloud
 from travjax.config import InputError, require, require_number
+from travjax.dem_options import DemOptions
 from travjax.files import sha256
+from travjax.formats import unfolded
 from travjax.grid import Grid
-from travjax.raster import (
-    COARSEST,
-    Raster,
-    agreed_cell_size,
-    crs_name,
-    require_heights,
-    require_metric,
-    require_size,
-    resample,
-    without_small_holes,
-)
+from travjax.memory import require_memory
+from travjax.raster import Raster, Survey, require_fine, require_known, require_size, survey
+from travjax.raster_files import read_raster
+from travjax.surface import Surface
+
+MOST_WINDOWS = 2**20
+"""Windows of a file, at most."""
+
+FAR_APART = 100.0
+"""Metres: maps of one file whose heights differ by more are each counted from a height of their own."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Windows:
     """Square maps cut out of a DEM, and where each comes from.
 
-    heights:       [n, rows, cols] float32 metres above `height_offset`, NaN unknown
     origins:       [n, 2] float64 x, y of each window's south-west node
     cell_size:     metres between values in the file; the windows are at the grid's spacing
-    crs:           coordinate system as the file names it, or None
-    height_offset: metres, subtracted from the file's heights in float64
+    crs:           coordinate system as the file names it, or None; of a file that names several, one for each window
+    height_offset: metres, subtracted from the file's heights in float64; of a file whose maps are each counted from a
+                   height of their own, [n, 1, 1]
     covered:       share of the file's area that lies in some window
-    filled:        share of all nodes that was interpolated in small holes
-    unknown:       share of all nodes that stays unknown
+    filled:        share of all cells that was interpolated in small holes
+    unknown:       share of all cells that stays unknown
     path, sha256:  the file and its checksum
+    notes:         lines about how the file was read that its user should know
     """
 
-    heights: np.ndarray
     origins: np.ndarray
     cell_size: float
-    crs: str | None
-    height_offset: float
+    crs: str | None | tuple[str | None, ...]
+    height_offset: float | np.ndarray
     covered: float
     filled: float
     unknown: float
     path: str
     sha256: str
+    notes: tuple[str, ...]
+    _grid: Grid
+    _surfaces: list[Surface]
+    _corners: np.ndarray  # [n, 3] surface, row, col
+
+    def __len__(self) -> int:
+        """The number of windows."""
+        return len(self._corners)
+
+    @cached_property
+    def heights(self) -> np.ndarray:
+        """All windows at once, [n, rows, cols] float32 metres above `height_offset`, NaN unknown.
+
+        Raises InputError when they do not fit into memory; `read` takes some of them.
+        """
+        size = 4 * len(self) * self._grid.nodes**2
+        require_memory(size, f"{self.path}: {len(self)} windows", "; take a larger stride, or some at a time")
+        return self.read(slice(None))
+
+    def read(self, which: slice | np.ndarray) -> np.ndarray:
+        """Returns some of the windows, [k, rows, cols] as in `heights`; quickest in their order."""
+        corners = self._corners[which]
+        cut = np.empty((len(corners), *self._grid.shape), np.float32)
+        with _naming(Path(self.path)):
+            for window, (surface, row, col) in zip(cut, corners.tolist(), strict=True):
+                window[...] = self._surfaces[surface].nodes(row, col, self._grid.nodes)
+        return cut
+
+    def systems(self, which: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Returns the name of the coordinate system of some of the windows, [k], "" for none."""
+        names = self.crs if isinstance(self.crs, tuple) else (self.crs,)
+        return np.broadcast_to(np.array([name or "" for name in names]), len(self))[which]
+
+    def offsets(self, which: slice | np.ndarray = slice(None)) -> np.ndarray:
+        """Returns the height offset of some of the windows, [k] metres."""
+        return np.broadcast_to(np.ravel(self.height_offset), len(self))[which]
 
 
 def load_dem(
@@ -67,175 +105,145 @@ def load_dem(
     nodata: float | None = None,
     fill_holes: bool = True,
     allow_coarse: bool = False,
+    band: int | str | None = None,
+    classes: tuple[int, ...] | None = None,
+    up: str | None = None,
+    gdal_drivers: tuple[str, ...] = (),
 ) -> Windows:
     """Cuts a DEM into windows of the grid's size, starting at its south-west corner; partial windows are dropped.
 
-    path:         GeoTIFF or another raster that rasterio reads (an ASCII grid, a 16-bit PNG); .npy, or .npz with
-                  `heights` ([rows, cols], or several maps [n, rows, cols] that are cut one by one) and `cell_size`; a
-                  point cloud as clouds.py reads it: text (.xyz, .txt, .csv, .pts), .ply, .las, .laz
+    Windows of a large raster are read from the file when they are asked for.
+
+    path:         GeoTIFF or another raster of local pixels that GDAL reads; .npy, or .npz with `heights` ([rows, cols],
+                  or several maps [n, rows, cols] that are cut one by one) and `cell_size`; a point cloud or a mesh as
+                  clouds.py reads it; any of them packed by gzip
     stride:       metres between the origins of neighbouring windows, rounded to whole cells
     cell_size:    metres, for files that do not say; of a point cloud the cells in which points are averaged, unless
                   they stand on a lattice: the grid's spacing, or what holds two points on average if that is more
-    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a PNG needs it
+    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a picture needs it
     nodata:       a value that marks unknown ground, if the file does not declare it
-    fill_holes:   interpolate holes whose every node lies within 0.125 m of known ground
+    fill_holes:   interpolate holes whose every cell lies within 0.125 m, or one cell, of known ground
     allow_coarse: take cells larger than 0.125 m
-    Raises InputError when the file is missing, is no elevation map, is in degrees or feet, has no, a non-square or too
-    large a cell size or not the given one, infinite or absurd heights or none at all, or is smaller than one window.
+    band:         number from 1, or description, of a band; name of a variable of a netCDF file, "name:2" for its second
+    classes:      of LAS points that are ground; ground alone where the file has it beside others, unless given
+    up:           "y" where that axis of a point cloud or mesh points up; "z" unless given
+    gdal_drivers: drivers of GDAL that may read the file beside those in raster_files.DRIVERS
+    Raises InputError when the file is missing, is no elevation map, is in degrees, feet or another system whose metre
+    is none on the ground, has no, a non-square or too large a cell size or not the given one, infinite or absurd
+    heights or none at all, is smaller than one window, or does not fit into memory.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
-    for name, value in (("cell_size", cell_size), ("height_scale", height_scale)):
-        if value is not None:
-            require_number(name, value, 0, 1000, "metres, above 0 and at most 1000")
-    try:
-        read = _read(path, cell_size, height_scale, nodata, grid)
-        rasters = [_checked(raster, grid, allow_coarse) for raster in read]
-        offset = float(np.nanmedian([np.nanmedian(raster.heights) for raster in rasters]).round()) + 0.0
-        parts = [_windows(raster, stride, grid, offset, fill_holes) for raster in rasters]
+    options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)
+    with _naming(path):
+        rasters = _read(path, options, grid)
+        for raster in rasters:
+            require_fine(raster.cell_size, allow_coarse)
+            north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
+            require_size(east, north, grid)
+        corners, covered = _corners(rasters, stride, grid)
+        surveys = [survey(raster.heights) for raster in rasters]
+        require_known(sum(found.known for found in surveys))
+        offsets = _offsets(rasters, surveys)
+        base = [
+            0.0 if raster.height_offset is not None else offset for raster, offset in zip(rasters, offsets, strict=True)
+        ]
+        surfaces = [
+            Surface(raster, grid.spacing, above, fill_holes and raster.height_offset is None)
+            for raster, above in zip(rasters, base, strict=True)
+        ]
         checksum = sha256(path)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    heights, origins, covered, filled, unknown = zip(*parts, strict=True)
+    filled = float(np.mean([surface.filled for surface in surfaces]))
+    known = np.mean(
+        [found.known / np.prod(raster.heights.shape) for found, raster in zip(surveys, rasters, strict=True)]
+    )
+    origins = np.array([raster.origin for raster in rasters])
+    systems = {raster.crs for raster in rasters}
     return Windows(
-        heights=np.concatenate(heights),
-        origins=np.concatenate(origins),
+        origins=origins[corners[:, 0]] + grid.spacing * corners[:, :0:-1],
         cell_size=rasters[0].cell_size,
-        crs=rasters[0].crs,
-        height_offset=offset,
-        covered=float(np.mean(covered)),
-        filled=float(np.mean(filled)),
-        unknown=float(np.mean(unknown)),
+        crs=rasters[0].crs if len(systems) == 1 else tuple(rasters[one].crs for one in corners[:, 0]),
+        height_offset=offsets[0] if len(set(offsets)) == 1 else np.array(offsets)[corners[:, 0], None, None],
+        covered=covered,
+        filled=filled,
+        unknown=float(1 - known - filled),
         path=str(path),
         sha256=checksum,
+        notes=tuple(note for raster in rasters for note in raster.notes),
+        _grid=grid,
+        _surfaces=surfaces,
+        _corners=corners,
     )
 
 
-def _windows(raster: Raster, stride: float, grid: Grid, offset: float, fill_holes: bool):
-    """(heights, origins, share covered, share filled, share unknown) of one raster."""
-    raster, filled = without_small_holes(raster) if fill_holes else (raster, 0.0)
-    raster = resample(raster, grid.spacing)
-    heights = (raster.heights - offset).astype(np.float32)
-    step = round(stride / grid.spacing)
-    rows, cols = (range(0, edge - grid.cells, step) for edge in heights.shape)
-    corners = np.array([(row, col) for row in rows for col in cols])
-    cut = np.stack([heights[row : row + grid.nodes, col : col + grid.nodes] for row, col in corners])
-    across = [(len(starts) - 1) * min(step, grid.cells) + grid.cells for starts in (rows, cols)]
-    covered = np.prod(across) / np.prod(np.array(heights.shape) - 1)
-    origins = np.array(raster.origin) + grid.spacing * corners[:, ::-1]
-    return cut, origins, covered, filled, np.isnan(heights).mean()
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Puts the file's name before what is wrong with it."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    except MemoryError as error:
+        raise InputError(f"{path}: does not fit into memory: {error}") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def _read(path: Path, cell_size: float | None, scale: float | None, nodata: float | None, grid: Grid) -> list[Raster]:
+def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
+    """The rasters of a file, by what it holds."""
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
         raise InputError("no such file")
-    if path.suffix.lower() in (".npy", ".npz"):
-        return _read_numpy(path, cell_size, scale, nodata)
-    if path.suffix.lower() in SUFFIXES:
-        return [read_cloud(path, cell_size, scale, nodata, grid)]
-    return [_read_raster(path, cell_size, scale, nodata)]
+    with unfolded(path) as (readable, form):
+        if form == "npy":
+            rasters = read_npy(readable, options)
+        elif form == "npz":
+            rasters = _read_archive(readable, options, grid)
+        elif form == "raster":
+            rasters = [read_raster(readable, options)]
+        else:
+            rasters = [read_cloud(readable, form, options, grid)]
+        if readable != path:  # a copy, which goes
+            rasters = [replace(raster, heights=_all(raster)) for raster in rasters]
+    return rasters
 
 
-def _read_numpy(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
-    try:
-        with path.open("rb") as file:
-            loaded = np.load(file, allow_pickle=False)
-            wanted = ("heights", "cell_size", "origin", "crs", "height_offset")
-            one = isinstance(loaded, np.ndarray)
-            entries = {"heights": loaded} if one else {name: loaded[name] for name in wanted if name in loaded}
-            names = [] if one else list(loaded)
-    except (ValueError, EOFError, KeyError, zipfile.BadZipFile, zlib.error) as error:
-        reason = "it is no such file, or cut short" if "pickled" in str(error) else str(error) or "it is cut short"
-        raise InputError(f"cannot be read as {path.suffix}: {reason.splitlines()[0]}") from None
+def _all(raster: Raster) -> np.ndarray:
+    rows, cols = raster.heights.shape
+    require_memory(8 * rows * cols, f"{rows} x {cols} heights", "; unpack it first")
+    return np.array(raster.heights[0:rows, 0:cols])
+
+
+def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
+    entries, names = read_npz(path)
     if "heights" not in entries:
         raise InputError(f"no array `heights`; it holds: {', '.join(names) or 'nothing'}")
-    heights = entries["heights"]
-    if heights.ndim not in (2, 3) or not heights.size or not _is_real(heights):
-        raise InputError(
-            f"heights: {heights.dtype} {list(heights.shape)}: must be numbers [rows, cols] or [n, rows, cols]"
-        )
-    maps = _in_metres(heights.reshape(-1, *heights.shape[-2:]), scale or 1.0, 0.0, nodata)
-    each = len(maps)
-    if "cell_size" in entries:
-        stored = _numbers(entries["cell_size"], "cell_size", "one number of metres", (1,))[0]
-        cell_size = agreed_cell_size(stored, cell_size)
-    elif cell_size is None:
-        raise InputError("cell_size is missing: give it (--cell-size METRES), or store `cell_size` in the .npz")
-    origins = _numbers(
-        entries.get("origin", np.zeros(2)), "origin", "x, y of the south-west value", (2,), (each, 2)
-    ).reshape(-1, 2)
-    offsets = _numbers(entries.get("height_offset", np.zeros(1)), "height_offset", "metres", (1,), (each,))
-    crs = str(np.ravel(entries["crs"])[0]) or None if np.size(entries.get("crs", ())) else None
-    described = zip(maps, np.broadcast_to(origins, (each, 2)), np.broadcast_to(offsets, each), strict=True)
-    return [Raster(one + offset, cell_size, (float(x), float(y)), crs) for one, (x, y), offset in described]
+    return rasters_of(entries, options, names)
 
 
-def _is_real(array: np.ndarray) -> bool:
-    return array.dtype.kind in "iuf"
+def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarray, float]:
+    """Of each window the raster, and row and column of its south-west node: [n, 3]; and the share that they cover."""
+    step, found, covered = round(stride / grid.spacing), [], []
+    for index, raster in enumerate(rasters):
+        nodes = [int((edge - 1) * raster.cell_size / grid.spacing + 1e-6) + 1 for edge in raster.heights.shape]
+        rows, cols = (np.arange(0, edge - grid.cells, step) for edge in nodes)
+        if len(rows) * len(cols) > MOST_WINDOWS:
+            raise InputError(f"windows = {len(rows) * len(cols)}: must be at most {MOST_WINDOWS}; take a larger stride")
+        row, col = (places.ravel() for places in np.meshgrid(rows, cols, indexing="ij"))
+        found.append(np.stack([np.full(len(row), index), row, col], axis=1))
+        across = [(len(starts) - 1) * min(step, grid.cells) + grid.cells for starts in (rows, cols)]
+        covered.append(np.prod(across) / np.prod(np.array(nodes) - 1))
+    return np.concatenate(found), float(np.mean(covered))
 
 
-def _numbers(value: np.ndarray, name: str, allowed: str, *shapes: tuple[int, ...]) -> np.ndarray:
-    """Finite numbers of one of the shapes; a single one counts as [1]."""
-    array = np.atleast_1d(value)
-    fits = array.shape in shapes and _is_real(array) and bool(np.isfinite(array).all())
-    require(fits, name, value.tolist(), allowed)
-    return array.astype(float)
-
-
-def _in_metres(values: np.ndarray, scale: float, offset: float, nodata: float | None) -> np.ndarray:
-    """float64 heights; `nodata` is compared as the file's number type holds it."""
-    heights = values.astype(np.float64) * scale + offset
-    if nodata is not None:
-        heights[values == np.asarray(nodata).astype(values.dtype)] = np.nan
-    return heights
-
-
-def _read_raster(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> Raster:
-    try:
-        import rasterio
-    except ImportError:
-        raise InputError("reading it needs rasterio: pip install rasterio; .npy and .npz need nothing") from None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)
-            with rasterio.open(path) as file:
-                require(file.count == 1, "bands", file.count, "1: an elevation map, not a picture")
-                values, transform, crs = file.read(1, masked=True), file.transform, file.crs
-                scales, offsets, driver = file.scales, file.offsets, file.driver
-    except rasterio.errors.RasterioError as error:
-        reason = str(error.__cause__ or error).splitlines()[0]
-        unknown = f"; beside GDAL's formats: .npy, .npz, {', '.join(SUFFIXES)}" if "not recognized" in reason else ""
-        raise InputError(f"not a raster that can be read: {reason}{unknown}") from None
-    if not _is_real(values):
-        raise InputError(f"heights: {values.dtype}: must be numbers")
-    if driver in ("PNG", "JPEG", "GIF", "BMP", "WEBP") and scale is None:
-        raise InputError(f"height_scale is missing: a {driver} holds no metres; give it (--height-scale METRES)")
-    require_metric(crs, scale is not None)
-    if transform.is_identity:
-        if cell_size is None:
-            raise InputError("cell_size is missing: the file is not georeferenced; give it (--cell-size METRES)")
-        west, south = 0.0, 0.0
-    elif transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
-        raise InputError(f"transform = {tuple(transform)[:6]}: must run east and south without rotation")
-    elif abs(transform.a + transform.e) > 1e-4 * transform.a:
-        raise InputError(f"cell_size = {transform.a:g} x {-transform.e:g}: must be square")
-    else:
-        cell_size = agreed_cell_size(transform.a, cell_size)
-        west, south = rasterio.transform.xy(transform, len(values) - 1, 0)
-    heights = _in_metres(values.data, scales[0] if scale is None else scale, offsets[0], nodata)
-    heights[np.ma.getmaskarray(values)] = np.nan
-    return Raster(heights[::-1], float(cell_size), (float(west), float(south)), crs_name(crs))
-
-
-def _checked(raster: Raster, grid: Grid, allow_coarse: bool) -> Raster:
-    require_heights(raster.heights[~np.isnan(raster.heights)])
-    if raster.cell_size > COARSEST + 1e-9 and not allow_coarse:
-        raise InputError(f"cell_size = {raster.cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it)")
-    north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
-    require_size(east, north, grid)
-    return raster
+def _offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
+    """Whole metres above which the heights of each raster are counted: the same unless they lie FAR_APART."""
+    if rasters[0].height_offset is not None:
+        return [raster.height_offset or 0.0 for raster in rasters]
+    medians = np.array([found.median for found in surveys])
+    common = float(np.nanmedian(medians).round()) + 0.0
+    if np.nanmax(np.abs(medians - common)) <= FAR_APART:
+        return [common] * len(rasters)
+    return [common if np.isnan(median) else float(median.round()) + 0.0 for median in medians]

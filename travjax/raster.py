@@ -1,18 +1,17 @@
-"""Rasters of heights: what holds for every format, small holes filled, other spacings (SPEC section 11).
+"""Rasters of heights: what holds for every format (SPEC section 11).
 
 Row 0 is the southernmost, column 0 the westernmost: north is +row, east is +col, whichever way a file is stored.
+Heights are read part by part, so that a raster may be larger than memory.
 """
 
-import re
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from travjax.config import InputError, require, require_number
 from travjax.grid import HIGHEST, Grid
-
-FILL_DISTANCE = 0.125
-"""Metres: a hole is filled when each of its nodes is this near to known ground."""
 
 COARSEST = 0.125
 """Metres: cells larger than this do not show a step or a rock."""
@@ -23,35 +22,169 @@ LOWEST = -12_000.0
 MARKERS = (-9999, -99999, -32768, 9999)
 """Usual marks of unknown ground that some files do not declare."""
 
+PART = 2**22
+"""Cells of a raster that are in memory at once while it is read through: 32 MiB."""
+
+SAMPLE = 2**24
+"""Known heights of which the median is taken; of larger rasters every second, third ... value counts."""
+
+
+class Heights(Protocol):
+    """Metres [rows, cols], NaN unknown, of which parts are read as they are asked for; an array is one."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(rows, cols)."""
+
+    def __getitem__(self, part: tuple[slice, slice]) -> np.ndarray:
+        """A part between whole, positive numbers, [rows, cols] float64."""
+
 
 @dataclass(frozen=True)
 class Raster:
     """Heights of one file in this package's convention.
 
-    heights:   [rows, cols] float64 metres, NaN unknown
-    cell_size: metres between neighbouring values
-    origin:    x, y of heights[0, 0], the south-west value
-    crs:       coordinate system as the file names it, or None
-    notes:     lines about how the file was read that its user should know
+    heights:       [rows, cols] float64 metres, NaN unknown
+    cell_size:     metres between neighbouring values
+    origin:        x, y of heights[0, 0], the south-west value
+    crs:           coordinate system as the file names it, or None
+    notes:         lines about how the file was read that its user should know
+    height_offset: metres above which the heights are counted already, where it is a window that was written so
     """
 
-    heights: np.ndarray
+    heights: Heights
     cell_size: float
     origin: tuple[float, float] = (0.0, 0.0)
     crs: str | None = None
     notes: tuple[str, ...] = ()
+    height_offset: float | None = None
+
+
+class InMetres:
+    """Values of a file as heights, turned into metres part by part; see Heights.
+
+    values:   [rows, cols] numbers of any type, in memory or mapped from a file
+    scale:    metres a unit
+    offset:   metres, added
+    unknown:  [rows, cols] bool, or None
+    nodata:   value that marks unknown ground as well, or None; one that the type cannot hold marks nothing
+    southern: whether row 0 of the values is the southernmost
+    """
+
+    def __init__(
+        self,
+        values: np.ndarray,
+        scale: float = 1.0,
+        offset: float = 0.0,
+        unknown: np.ndarray | None = None,
+        nodata: float | None = None,
+        southern: bool = True,
+    ):
+        order = slice(None) if southern else slice(None, None, -1)
+        self._values = values[order]
+        self._unknown = None if unknown is None else unknown[order]
+        self._scale, self._offset, self._nodata = scale, offset, as_stored(nodata, values.dtype)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self._values.shape
+
+    def __getitem__(self, part: tuple[slice, slice]) -> np.ndarray:
+        values = self._values[part]
+        heights = values.astype(np.float64)
+        if self._scale != 1:
+            heights *= self._scale
+        if self._offset:
+            heights += self._offset
+        if self._unknown is not None:
+            heights[self._unknown[part]] = np.nan
+        if self._nodata is not None:
+            heights[values == self._nodata] = np.nan
+        return heights
+
+
+def as_stored(nodata: float | None, dtype: np.dtype) -> np.generic | None:
+    """Returns the value as that number type holds it, or None where it cannot; only fractions may be rounded."""
+    if nodata is None:
+        return None
+    if dtype.kind in "iu":
+        limits = np.iinfo(dtype)
+        whole = float(nodata).is_integer() and limits.min <= int(nodata) <= limits.max
+        return dtype.type(int(nodata)) if whole else None
+    return dtype.type(nodata) if abs(nodata) <= np.finfo(dtype).max else None
+
+
+def marks_nothing(nodata: float | None, dtype: np.dtype) -> tuple[str, ...]:
+    """Returns a note where a value that was given to mark unknown ground cannot occur among numbers of that type."""
+    missed = nodata is not None and as_stored(nodata, dtype) is None
+    return (f"nodata = {nodata:g} marks nothing: the file holds {dtype.name}",) if missed else ()
+
+
+def is_real(dtype: np.dtype) -> bool:
+    """Whether numbers of that type can be heights."""
+    return dtype.kind in "iuf"
+
+
+def parts(heights: Heights, beyond: int = 0) -> Iterator[tuple[slice, slice, np.ndarray]]:
+    """Reads heights through from south to north, some rows at a time.
+
+    Yields the rows, where they stand in the part that was read, and that part [rows, cols] with up to `beyond` rows
+    more on both sides.
+    """
+    rows, cols = heights.shape
+    count = max(PART // max(cols, 1), 1)
+    for start in range(0, rows, count):
+        stop = min(start + count, rows)
+        first, last = max(start - beyond, 0), min(stop + beyond, rows)
+        yield slice(start, stop), slice(start - first, stop - first), heights[first:last, 0:cols]
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What a raster holds.
+
+    known:           number of cells whose height is known
+    lowest, highest: metres, of these; NaN where there are none
+    median:          metres, of these or of a SAMPLE of them; NaN where there are none
+    """
+
+    known: int
+    lowest: float
+    highest: float
+    median: float
+
+
+def survey(heights: Heights) -> Survey:
+    """Reads a raster through; raises InputError when a height cannot be one, or is an undeclared mark of none."""
+    every = max(int(np.prod(heights.shape)) // SAMPLE, 1)
+    known, lowest, highest, sampled = 0, np.inf, -np.inf, []
+    for _, _, part in parts(heights):
+        values = part[~np.isnan(part)]
+        if values.size:
+            known += values.size
+            lowest, highest = min(lowest, values.min()), max(highest, values.max())
+            sampled.append(values[::every])
+    if not known:
+        return Survey(0, np.nan, np.nan, np.nan)
+    require_heights(np.array([lowest, highest]))
+    return Survey(known, float(lowest), float(highest), float(np.median(np.concatenate(sampled))))
 
 
 def require_heights(known: np.ndarray) -> None:
     """Raises InputError unless there are heights, [n] without NaN, and all of them can be the ground's."""
-    if not known.size:
-        raise InputError("heights: all unknown (NaN or nodata): must hold some known ground")
+    require_known(known.size)
     for bad in (known.min(), known.max()):
         hint = "if it marks unknown ground, say so (--nodata=VALUE)"
         if not LOWEST <= bad <= HIGHEST:
             raise InputError(f"heights = {bad:g}: must lie between {LOWEST:g} and {HIGHEST:g} m; {hint}")
         if round(float(bad), 6) in MARKERS:
             raise InputError(f"heights = {bad:g}: is a usual mark of unknown ground, not declared as such; {hint}")
+
+
+def require_known(count: int) -> None:
+    """Raises InputError when no height of a file is known."""
+    if not count:
+        raise InputError("heights: all unknown (NaN or nodata): must hold some known ground")
 
 
 def require_size(east: float, north: float, grid: Grid) -> None:
@@ -62,110 +195,15 @@ def require_size(east: float, north: float, grid: Grid) -> None:
         )
 
 
+def require_fine(cell_size: float, allow_coarse: bool) -> None:
+    """Raises InputError for cells that do not show a step, unless they are allowed."""
+    if cell_size > COARSEST + 1e-9 and not allow_coarse:
+        raise InputError(f"cell_size = {cell_size:g}: must be at most {COARSEST:g} m (--allow-coarse takes it)")
+
+
 def agreed_cell_size(of_file: float, given: float | None) -> float:
     """The file's cell size; raises InputError for a bad one, or when the one given contradicts it."""
     require_number("cell_size", of_file, 0, 1000, "metres, above 0 and at most 1000")
     if given is not None:
         require(abs(given - of_file) < 1e-4 * of_file, "cell_size", given, f"left out: the file says {of_file:g}")
     return of_file
-
-
-def crs_name(crs) -> str | None:
-    """A coordinate system of rasterio by its code, else as WKT; of one joined with a height system its own part."""
-    if crs is None:
-        return None
-    horizontal = re.search(r'AUTHORITY\["EPSG","(\d+)"\]\],VERT_CS\[', crs.to_wkt())
-    return f"EPSG:{horizontal[1]}" if horizontal else crs.to_string()
-
-
-def require_metric(crs, heights_scaled: bool) -> None:
-    """Raises InputError for degrees and feet; no system, or a local one that names no unit, is taken as metres.
-
-    heights_scaled: whether a height scale was given, so that the system's unit of height does not count
-    """
-    if crs is None:
-        return
-    name = str(crs_name(crs))
-    name = name.partition("[")[2].partition(",")[0] or name
-    if crs.is_geographic:
-        raise InputError(f"crs = {name}: is in degrees; reproject it to metres (a UTM zone, say) first")
-    unit, metres = crs.units_factor
-    if unit.lower() != "unknown" and abs(metres - 1) > 1e-9:
-        raise InputError(f"crs = {name}: is in units of {metres:g} m ({unit}); reproject it to metres first")
-    vertical = re.search(r'VERT_CS\[.*UNIT\["([^"]*)",([0-9.eE+-]+)', crs.to_wkt())
-    if vertical and abs(float(vertical[2]) - 1) > 1e-9 and not heights_scaled:
-        raise InputError(
-            f"crs = {name}: has heights in units of {float(vertical[2]):g} m ({vertical[1]}); "
-            f"give that (--height-scale={vertical[2]})"
-        )
-
-
-def without_small_holes(raster: Raster) -> tuple[Raster, float]:
-    """Interpolates holes whose every node lies within FILL_DISTANCE of known ground; also the share of nodes filled."""
-    unknown = np.isnan(raster.heights)
-    if not unknown.any():
-        return raster, 0.0
-    from scipy import ndimage  # takes 0.3 s to import
-
-    far = ndimage.distance_transform_edt(unknown, sampling=raster.cell_size) > FILL_DISTANCE + 1e-9
-    hole, holes = ndimage.label(unknown, np.ones((3, 3)))
-    deep = np.zeros(holes + 1, bool)
-    deep[hole[far]] = True
-    small = unknown & ~deep[hole]
-    if not small.any():
-        return raster, 0.0
-    return replace(raster, heights=_interpolated(raster.heights, small)), float(small.mean())
-
-
-def _interpolated(heights: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Heights where each node of a hole is the mean of its four neighbours: a plane stays one, no new extremes arise.
-
-    What lies outside the raster does not count. Nodes beside a hole are known or of the same hole.
-    """
-    from scipy.sparse import csc_matrix, diags
-    from scipy.sparse.linalg import spsolve
-
-    row, col = np.nonzero(holes)
-    number = np.full(holes.shape, -1)
-    number[holes] = np.arange(len(row))
-    level = heights[~np.isnan(heights)].mean()
-    neighbours, known = np.zeros(len(row)), np.zeros(len(row))
-    links = []
-    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        r, c = row + down, col + right
-        inside = (r >= 0) & (r < holes.shape[0]) & (c >= 0) & (c < holes.shape[1])
-        beside = np.flatnonzero(inside)
-        neighbours += inside
-        other = number[r[beside], c[beside]]
-        ground = other < 0
-        known[beside[ground]] += heights[r[beside[ground]], c[beside[ground]]] - level
-        links.append(np.stack([beside[~ground], other[~ground]]))
-    here, there = np.concatenate(links, axis=1)
-    coupling = csc_matrix((np.ones(len(here)), (here, there)), (len(row), len(row)))
-    filled = heights.copy()
-    filled[holes] = spsolve(diags(neighbours, format="csc") - coupling, known) + level
-    return filled
-
-
-def resample(raster: Raster, spacing: float) -> Raster:
-    """Bilinear values at another spacing, from the same south-west node; smoothed first where the source is finer.
-
-    A node is unknown where a value that it is made from is.
-    """
-    ratio = spacing / raster.cell_size
-    if abs(ratio - 1) < 1e-6:
-        return raster
-    from scipy import ndimage  # takes 0.3 s to import
-
-    unknown = np.isnan(raster.heights)
-    level = np.nanmedian(raster.heights)
-    heights, share = np.where(unknown, 0.0, raster.heights - level), (~unknown).astype(float)
-    if ratio > 1:
-        sigma = (ratio - 1) / 2
-        heights, share = (ndimage.gaussian_filter(field, sigma, mode="nearest") for field in (heights, share))
-        heights = np.divide(heights, share, out=heights, where=share > 0)
-    rows, cols = (np.arange(int((edge - 1) / ratio + 1e-6) + 1) * ratio for edge in raster.heights.shape)
-    at = np.meshgrid(rows, cols, indexing="ij")
-    values = ndimage.map_coordinates(heights, at, order=1, mode="nearest")
-    missing = ndimage.map_coordinates(unknown.astype(float), at, order=1, mode="nearest") > 1e-6
-    return replace(raster, heights=np.where(missing, np.nan, values + level), cell_size=spacing)
