@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
-from pyproj import CRS, Proj
+from pyproj import CRS, Proj, Transformer
 from pyproj.exceptions import CRSError, ProjError
 
 from travjax.config import InputError
+
+EARTH = 6_378_137.0
+"""Metres: the radius of the earth at the equator."""
 
 MOST_STRETCH = 1e-3
 """Share by which a metre of a coordinate system may differ from one on the ground: UTM stays below it in its zone."""
@@ -122,6 +125,23 @@ def _is_vague(name: str) -> bool:
         return not parsed(name)
     except InputError:
         return True
+
+
+def places(name: str, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+    """Returns where points of a system lie: the radius of their planet [m], and [n, 3] metres from its centre.
+
+    On earth in WGS 84; systems that differ in their realisation of the same frame are some metres apart at most.
+    name: of a system that is not local
+    """
+    crs = horizontal(parsed(name))
+    radius = crs.ellipsoid.semi_major_metre if crs.ellipsoid else EARTH
+    if abs(radius / EARTH - 1) < 0.01:
+        to_centre = Transformer.from_crs(crs, "EPSG:4978", always_xy=True)
+        return EARTH, np.stack(to_centre.transform(x, y, np.zeros_like(x)), axis=-1)
+    longitude, latitude = np.radians(Proj(crs)(x, y, inverse=True))
+    level = np.cos(latitude)
+    unit = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=-1)
+    return float(round(radius)), radius * unit
 
 
 def require_height_unit(where: str, unit: str, metres: float, heights_scaled: bool) -> None:

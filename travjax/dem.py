@@ -154,10 +154,9 @@ def load_dem(
             for raster, above in zip(rasters, base, strict=True)
         ]
         checksum = sha256(path)
-    filled = float(np.mean([surface.filled for surface in surfaces]))
-    known = np.mean(
-        [found.known / np.prod(raster.heights.shape) for found, raster in zip(surveys, rasters, strict=True)]
-    )
+    cells = np.array([raster.heights.shape for raster in rasters]).prod(axis=1)
+    filled = np.array([surface.filled for surface in surfaces])
+    missing = cells - filled - [found.known for found in surveys]
     origins = np.array([raster.origin for raster in rasters])
     systems = {raster.crs for raster in rasters}
     return Windows(
@@ -166,8 +165,8 @@ def load_dem(
         crs=rasters[0].crs if len(systems) == 1 else tuple(rasters[one].crs for one in corners[:, 0]),
         height_offset=offsets[0] if len(set(offsets)) == 1 else np.array(offsets)[corners[:, 0], None, None],
         covered=covered,
-        filled=filled,
-        unknown=float(1 - known - filled),
+        filled=float(np.mean(filled / cells)),
+        unknown=float(np.mean(missing / cells)),
         path=str(path),
         sha256=checksum,
         notes=tuple(note for raster in rasters for note in raster.notes),

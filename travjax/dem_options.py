@@ -38,7 +38,7 @@ class DemOptions:
         if self.nodata is not None and self.nodata != self.nodata:  # NaN is unknown ground in any case
             object.__setattr__(self, "nodata", None)
         if self.nodata is not None:
-            require_number("nodata", self.nodata, -math.inf, math.inf, "a finite number, or nan")
+            require_number("nodata", self.nodata, -math.inf, math.inf, "a number: finite, or nan")
         numbered = isinstance(self.band, int) and not isinstance(self.band, bool) and self.band >= 1
         named = isinstance(self.band, str) and bool(self.band)
         require(self.band is None or numbered or named, "band", self.band, "a number from 1, or a name")

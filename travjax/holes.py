@@ -18,7 +18,7 @@ end falls by a factor of e on a third of the width.
 class SmallHoles:
     """Which cells of a raster lie in small holes.
 
-    share: of all cells
+    count: of these cells
     """
 
     def __init__(self, heights: Heights, cell_size: float):
@@ -26,12 +26,11 @@ class SmallHoles:
         self._cols, self._distance = heights.shape[1], max(FILL_DISTANCE, cell_size) + 1e-9
         self._packed: dict[int, np.ndarray] = {}  # of the rows that have any, a bit a cell
         holes = _Holes(heights, cell_size, self._distance)
-        filled = 0
+        self.count = 0
         for rows, small in holes.small():
             for row in np.flatnonzero(small.any(axis=1)):
                 self._packed[rows.start + int(row)] = np.packbits(small[row])
-                filled += int(np.count_nonzero(small[row]))
-        self.share = filled / max(int(np.prod(heights.shape)), 1)
+                self.count += int(np.count_nonzero(small[row]))
 
     def within(self, rows: slice, cols: slice) -> np.ndarray | None:
         """Which cells of a part lie in small holes, [rows, cols] bool; None where none does."""
@@ -72,18 +71,19 @@ class _Holes:
         from scipy.sparse.csgraph import connected_components
 
         deep, links, above, total = [np.zeros(0, bool)], [np.zeros((2, 0), int)], None, 0
-        beyond = int(self.distance / self.cell_size) + 1
-        for _, own, part in parts(self.heights, beyond):
+        reach = int(self.distance / self.cell_size)
+        along = self.cell_size * np.arange(-reach, reach + 1)
+        near = np.hypot(along[:, None], along) <= self.distance
+        for _, own, part in parts(self.heights, reach):
             missing = np.isnan(part)
             unknown = missing[own]
             if not unknown.any():
                 above = None
                 continue
-            far = ndimage.distance_transform_edt(missing, sampling=self.cell_size)[own] > self.distance
-            far |= unknown & missing.all()  # no known cell to be near to
+            far = ndimage.binary_erosion(missing, near, border_value=1)[own]  # nothing known within reach
             hole, count = _numbered(unknown)
             part_deep = np.zeros(count + 1, bool)
-            part_deep[hole[far & unknown]] = True
+            part_deep[hole[far]] = True
             deep.append(part_deep[1:])
             hole = np.where(unknown, hole + total, 0)  # groups count from 1
             if above is not None:

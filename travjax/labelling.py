@@ -37,14 +37,15 @@ def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid) -> Iterat
 def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
     """The windows of named sites, with where on the site each lies."""
     for name, windows in sites:
-        for start in range(0, len(windows.heights), BATCH):
-            heights = windows.heights[start : start + BATCH]
+        for start in range(0, len(windows), BATCH):
+            some = slice(start, start + BATCH)
+            heights = windows.read(some)
             yield {
                 "heights": heights,
                 "group": np.full(len(heights), name),
-                "origin": windows.origins[start : start + BATCH],
-                "height_offset": np.full(len(heights), windows.height_offset),
-                "crs": np.full(len(heights), windows.crs or ""),
+                "origin": windows.origins[some],
+                "height_offset": windows.offsets(some),
+                "crs": windows.systems(some),
             }
 
 
@@ -53,6 +54,11 @@ def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Ba
     margins = simulate(batch["heights"], robot, actions, grid=grid)
     arrays = dataclasses.asdict(margins) | {"failed": failures(margins, robot)}
     return batch | {name: np.asarray(array) for name, array in arrays.items()}
+
+
+def bytes_each(actions: ActionSpace, grid: Grid) -> int:
+    """Returns how much a labelled map takes: heights, three margins, `known` and three flags a trajectory."""
+    return 4 * grid.nodes**2 + len(actions) * (3 * 4 + 1 + 3)
 
 
 def joined(batches: list[Batch]) -> Batch:

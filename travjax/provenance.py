@@ -1,13 +1,14 @@
 """Where real maps come from: the sites as they are asked for, and of each window its place and how it was turned."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from travjax.config import from_json, load_toml, require, require_number, to_json
+from travjax.dem_options import DemOptions
 
 SPLITS = ("train", "validation", "test")
 
@@ -29,7 +30,7 @@ class Site:
     split: of its windows that lie in no strip
     test_strip, validation_strip: side of the site and metres; for the windows that lie wholly in that strip along
         the outermost windows of the side
-    cell_size, height_scale, nodata: as `load_dem` takes them
+    cell_size, height_scale, nodata, band, classes, up, gdal_drivers: as `load_dem` takes them
 
     Raises InputError that names field, value and what is allowed.
     """
@@ -42,6 +43,10 @@ class Site:
     cell_size: float | None = None
     height_scale: float | None = None
     nodata: float | None = None
+    band: int | str | None = None
+    classes: tuple[int, ...] | None = None
+    up: str | None = None
+    gdal_drivers: tuple[str, ...] = ()
 
     def __post_init__(self):
         require(isinstance(self.file, str) and bool(self.file), "file", self.file, "a non-empty text")
@@ -51,11 +56,7 @@ class Site:
             _require_strip(f"{split}_strip", strip)
             needless = SPLITS.index(self.split) >= SPLITS.index(split)
             require(not (strip and needless), f"{split}_strip", strip, f"left out where split is {self.split}")
-        for name in ("cell_size", "height_scale"):
-            if getattr(self, name) is not None:
-                require_number(name, getattr(self, name), 0, 1000, "metres, above 0 and at most 1000")
-        if self.nodata is not None:
-            require_number("nodata", self.nodata, -math.inf, math.inf, "a number")
+        DemOptions(**{field.name: getattr(self, field.name) for field in fields(DemOptions)})
 
     @property
     def group(self) -> str:
@@ -123,7 +124,9 @@ class SiteRecord:
 
     name:       the group of its maps
     file:        as asked for, here or under TRAVJAX_DATA
-    sha256, crs, cell_size, height_offset, covered, filled, unknown: as in `dem.Windows`
+    sha256, cell_size, covered, filled, unknown: as in `dem.Windows`
+    crs:         coordinate system as the file names it, or several
+    height_offset: metres, subtracted from the file's heights; None where its maps have one each
     windows:    all that were cut
     train, validation, test: of these, for each split; turned copies do not count
     too_unknown: of these, left out for too many unknown nodes or no known trajectory
@@ -136,7 +139,7 @@ class SiteRecord:
     sha256: str
     crs: str | None
     cell_size: float
-    height_offset: float
+    height_offset: float | None
     covered: float
     filled: float
     unknown: float

@@ -163,7 +163,7 @@ def survey(heights: Heights) -> Survey:
         if values.size:
             known += values.size
             lowest, highest = min(lowest, values.min()), max(highest, values.max())
-            sampled.append(values[::every])
+            sampled.append(values[::every].copy())  # not a view, which would keep all of them
     if not known:
         return Survey(0, np.nan, np.nan, np.nan)
     require_heights(np.array([lowest, highest]))

@@ -261,7 +261,9 @@ def _place(file: Any, placed: bool, cell_size: float | None) -> tuple[float, tup
             raise InputError("cell_size is missing: the file is not georeferenced; give it (--cell-size METRES)")
         return float(cell_size), (0.0, 0.0), False
     if not np.isfinite(tuple(transform)).all() or transform.b or transform.d or transform.a <= 0 or not transform.e:
-        raise InputError(f"transform = {tuple(transform)[:6]}: may run east and north, else must run east and south without rotation")
+        raise InputError(
+            f"transform = {tuple(transform)[:6]}: may run east and north, else must run east and south without rotation"
+        )
     southern = transform.e > 0
     if abs(transform.a - abs(transform.e)) > 1e-4 * transform.a:
         raise InputError(f"cell_size = {transform.a:g} x {abs(transform.e):g}: must be square")

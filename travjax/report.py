@@ -13,6 +13,10 @@ PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure
 """Shares of the paper's synthetic test trajectories that fail (SPEC section 10); its robot is not published in full."""
 
 
+AT_ONCE = 1024
+"""Maps whose flags are looked at together: they may lie on the disk."""
+
+
 def shares_table(
     groups: Sequence[str] | np.ndarray, failed: np.ndarray, known: np.ndarray, as_in_paper: bool = True
 ) -> str:
@@ -22,28 +26,35 @@ def shares_table(
     """
     members: np.ndarray = np.asarray(groups)
     names = list(dict.fromkeys(groups))
-    rows = [_shares(name, failed[members == name], known[members == name]) for name in names]
+    parts = [slice(start, start + AT_ONCE) for start in range(0, len(known), AT_ONCE)]
+    counts = np.concatenate([_failures(failed[part], known[part]) for part in parts])
+    rows = [_shares(name, counts[members == name], known.shape[1]) for name in names]
     if len(names) > 1:
-        rows.append(_shares("overall", failed, known))
+        rows.append(_shares("overall", counts, known.shape[1]))
     if as_in_paper:
         rows.append(["paper's test set", None, *(f"{share:.2%}" for share in PAPER_SHARES.values()), None, None])
     headers = ["", "maps", *PAPER_SHARES, "maps with none", "known"]
     return _table(rows, headers)
 
 
-def _shares(name: str, failed: np.ndarray, known: np.ndarray) -> list:
-    total = known.sum()
-    if not total:
-        return [name, len(known), *["-"] * 5, "0.0%"]
-    events = [failed[..., event][known].mean() for event in range(3)]
-    any_event: np.ndarray = np.asarray(failed.any(axis=-1) & known)
-    none = ~any_event[known.any(axis=-1)].any(axis=-1)
+def _failures(failed: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Of each map the known trajectories, those of them that fail by each event, and by any: [n, 5]."""
+    fails = np.asarray(failed) & np.asarray(known)[..., None]
+    return np.column_stack([known.sum(axis=1), fails.sum(axis=1), fails.any(axis=-1).sum(axis=1)])
+
+
+def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
+    """The row of some maps, from what `_failures` says of them: [n, 5]."""
+    known, *fails = counts.sum(axis=0)
+    if not known:
+        return [name, len(counts), *["-"] * 5, "0.0%"]
+    none = counts[counts[:, 0] > 0, -1] == 0
     return [
         name,
-        str(len(known)),
-        *(f"{share:.2%}" for share in (*events, any_event[known].mean())),
+        str(len(counts)),
+        *(f"{share / known:.2%}" for share in fails),
         f"{none.mean():.1%}",
-        f"{known.mean():.1%}",
+        f"{known / (len(counts) * trajectories):.1%}",
     ]
 
 

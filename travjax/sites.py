@@ -8,18 +8,20 @@ What becomes of a window is decided in this order:
 5. Other windows that share ground with a validation window, be it the nodes of an edge, are left out.
 6. The rest is for training, and is also turned by 90, 180 and 270 degrees and labelled anew.
 
-Two files lie on the same ground when they name the same coordinate system. Local systems, and none, say nothing about
-where on earth they are: each such file is a ground of its own.
+Where windows lie is compared in their coordinates where files name the same system, and on the planet where they name
+two, with some metres of doubt. Local systems, and none, say nothing about that: each such file is a ground of its own.
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from travjax.actions import ActionSpace
 from travjax.config import InputError
+from travjax.coordinates import is_local, places
 from travjax.dataset import CHUNK, Dataset, Progress
 from travjax.dem import Windows, load_dem
 from travjax.files import find_data
@@ -39,6 +41,9 @@ LEFT_OUT = {TOO_UNKNOWN: "too_unknown", NEAR_TEST: "near_test", SHARED: "shared"
 TOLERANCE = 1e-6
 """Metres by which places of windows may be off."""
 
+DOUBT = 10.0
+"""Metres by which places of two coordinate systems may be off: by realisations of a frame, or for want of grids."""
+
 
 def read(
     config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
@@ -54,9 +59,10 @@ def read(
     _require_different(found)
     label = lambda heights: _labels(heights, robot, actions, grid, on_progress)
     windows = _Candidates(found)
-    known_enough = windows.unknown <= config.max_unknown
-    labels = np.full((len(known_enough), len(actions)), UNKNOWN, np.uint8)
-    labels[known_enough] = label(windows.heights[known_enough])
+    labels = np.full((len(windows.site), len(actions)), UNKNOWN, np.uint8)
+    for some, heights in windows.batches():
+        enough = np.isnan(heights).mean(axis=(1, 2)) <= config.max_unknown
+        labels[some[enough]] = label(heights[enough])
     fate = _fates(config, windows, labels.min(axis=1) < UNKNOWN, grid.size)
     records = _records(config, found, windows.site, fate)
     _require_all(config, records, found, grid.size)
@@ -65,9 +71,10 @@ def read(
     copied = np.flatnonzero(fate == TRAIN) if config.rotations else kept[:0]
     source = np.concatenate([kept, *[copied] * 3])
     turns = np.repeat(np.arange(4, dtype=np.uint8), [len(kept), *[len(copied)] * 3])
-    heights = windows.heights[source]
+    heights = np.empty((len(source), *grid.shape), np.float32)
+    heights[: len(kept)] = windows.read(kept)
     for quarter in (1, 2, 3):
-        heights[turns == quarter] = turned(heights[turns == quarter], quarter)
+        heights[turns == quarter] = turned(heights[np.searchsorted(kept, copied)], quarter)
     return Dataset(
         heights=heights,
         labels=np.concatenate([labels[kept], label(heights[len(kept) :])]),
@@ -97,33 +104,49 @@ class _Candidates:
     found: list[Windows]
 
     @cached_property
-    def heights(self) -> np.ndarray:
-        return np.concatenate([windows.heights for windows in self.found])
-
-    @cached_property
     def origin(self) -> np.ndarray:
         return np.concatenate([windows.origins for windows in self.found])
 
     @cached_property
     def site(self) -> np.ndarray:
         """Index of the site of each: [n]."""
-        return np.repeat(np.arange(len(self.found)), [len(windows.heights) for windows in self.found])
+        return np.repeat(np.arange(len(self.found)), [len(windows) for windows in self.found])
 
     @cached_property
-    def ground(self) -> np.ndarray:
-        """Equal for windows whose places can be compared: [n]."""
-        systems = [windows.crs for windows in self.found]
-        first = [systems.index(crs) if _is_on_earth(crs) else index for index, crs in enumerate(systems)]
-        return np.array(first)[self.site]
+    def system(self) -> np.ndarray:
+        """The coordinate system of each by its name, and a name of the site's own where it is local: [n]."""
+        names = np.concatenate([windows.systems() for windows in self.found]).astype(object)
+        own = [index for index, name in enumerate(names) if is_local(name or None)]
+        names[own] = [f"site {site}" for site in self.site[own]]
+        return names
 
-    @cached_property
-    def unknown(self) -> np.ndarray:
-        """Share of unknown nodes of each: [n]."""
-        return np.isnan(self.heights).mean(axis=(1, 2))
+    def batches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yields the indices and the heights of some windows at a time, [k] and [k, rows, cols]."""
+        first = 0
+        for windows in self.found:
+            for start in range(0, len(windows), CHUNK):
+                heights = windows.read(slice(start, start + CHUNK))
+                yield first + start + np.arange(len(heights)), heights
+            first += len(windows)
 
+    def read(self, which: np.ndarray) -> np.ndarray:
+        """Returns the heights of some windows, [k, rows, cols]; which: [k] in rising order."""
+        sites = self.site[which]
+        first = np.cumsum([0, *(len(windows) for windows in self.found)])
+        return np.concatenate([self.found[one].read(which[sites == one] - first[one]) for one in np.unique(sites)])
 
-def _is_on_earth(crs: str | None) -> bool:
-    return crs is not None and not crs.startswith(("LOCAL_CS", "ENGCRS"))
+    def places(self, size: float) -> dict[float, tuple[np.ndarray, np.ndarray]]:
+        """Returns the middles of all windows that lie on a planet, by its radius: indices [k] and metres [k, 3]."""
+        found: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
+        for name in dict.fromkeys(self.system):
+            if not name.startswith("site "):
+                here = np.flatnonzero(self.system == name)
+                planet, xyz = places(name, *(self.origin[here] + size / 2).T)
+                found.setdefault(planet, []).append((here, xyz))
+        return {
+            planet: (np.concatenate([here for here, _ in parts]), np.concatenate([xyz for _, xyz in parts]))
+            for planet, parts in found.items()
+        }
 
 
 def _windows(site: Site, config: SitesConfig, grid: Grid) -> Windows:
@@ -135,6 +158,10 @@ def _windows(site: Site, config: SitesConfig, grid: Grid) -> Windows:
         cell_size=site.cell_size,
         height_scale=site.height_scale,
         nodata=site.nodata,
+        band=site.band,
+        classes=site.classes,
+        up=site.up,
+        gdal_drivers=site.gdal_drivers,
         fill_holes=config.fill_holes,
         allow_coarse=config.allow_coarse,
     )
@@ -168,9 +195,9 @@ def _fates(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: f
     asked = {split: _asked_for(split, config, windows, size) for split in ("validation", "test")}
     fate[~known] = TOO_UNKNOWN
     fate[known & asked["test"]] = TEST
-    fate[(fate == TRAIN) & _near(windows, fate == TEST, size + config.gap - TOLERANCE)] = NEAR_TEST
+    fate[(fate == TRAIN) & _near(windows, fate == TEST, size, size + config.gap - TOLERANCE)] = NEAR_TEST
     fate[(fate == TRAIN) & asked["validation"]] = VALIDATION
-    fate[(fate == TRAIN) & _near(windows, fate == VALIDATION, size + TOLERANCE)] = SHARED
+    fate[(fate == TRAIN) & _near(windows, fate == VALIDATION, size, size + TOLERANCE)] = SHARED
     return fate
 
 
@@ -194,31 +221,42 @@ def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
     return beyond + size <= metres + TOLERANCE
 
 
-def _near(windows: _Candidates, others: np.ndarray, reach: float) -> np.ndarray:
+def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -> np.ndarray:
     """Which windows have one of the `others` [n] bool on the same ground within reach: [n] bool.
 
-    reach: between the south-west nodes along the axis in which they lie farther apart; the window's size is where the
-    windows touch
+    size:  of a window
+    reach: between the south-west nodes along the axis in which they lie farther apart; the size is where windows touch
     """
     from scipy.spatial import KDTree  # takes 0.2 s to import
 
     near = np.zeros(len(others), bool)
-    for ground in np.unique(windows.ground[others]):
-        here = windows.ground == ground
+    for system in dict.fromkeys(windows.system[others]):
+        here = windows.system == system
         distance, _ = KDTree(windows.origin[here & others]).query(windows.origin[here], p=np.inf)
         near[here] = distance < reach
+    if len(dict.fromkeys(windows.system)) == 1:
+        return near
+    apart = reach + (np.sqrt(2) - 1) * size + DOUBT  # between middles, whichever way the windows are turned
+    for index, xyz in windows.places(size).values():
+        held = others[index]
+        for system in dict.fromkeys(windows.system[index[held]]):
+            own = windows.system[index] == system
+            distance, _ = KDTree(xyz[held & own]).query(xyz[~own])
+            near[index[~own]] |= distance < apart
     return near
 
 
 def _records(config: SitesConfig, found: list[Windows], site: np.ndarray, fate: np.ndarray) -> tuple[SiteRecord, ...]:
     names = dict(enumerate(SPLITS)) | LEFT_OUT
-    read = ("sha256", "crs", "cell_size", "height_offset", "covered", "filled", "unknown")
+    read = ("sha256", "cell_size", "covered", "filled", "unknown")
 
     def records() -> Iterator[SiteRecord]:
         for index, windows in enumerate(found):
             counts = np.bincount(fate[site == index], minlength=len(FATES)).tolist()
             fates = {names[one]: count for one, count in enumerate(counts)}
-            as_read = {name: getattr(windows, name) for name in read}
+            as_read: dict[str, Any] = {name: getattr(windows, name) for name in read}
+            as_read["crs"] = ", ".join(dict.fromkeys(windows.systems())) or None
+            as_read["height_offset"] = windows.height_offset if isinstance(windows.height_offset, float) else None
             site_of = config.site[index]
             yield SiteRecord(site_of.group, site_of.file, **as_read, windows=sum(counts), **fates)
 

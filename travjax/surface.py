@@ -21,7 +21,7 @@ class Surface:
     """Heights of a raster at another spacing, from the same south-west node.
 
     shape:  (rows, cols) of nodes
-    filled: share of the raster's cells that was interpolated in small holes
+    filled: number of the raster's cells that were interpolated in small holes
     """
 
     def __init__(self, raster: Raster, spacing: float, offset: float, fill_holes: bool):
@@ -31,7 +31,7 @@ class Surface:
         rows, cols = (int((edge - 1) / self._ratio + 1e-6) + 1 for edge in raster.heights.shape)
         self.shape = rows, cols
         self._holes = SmallHoles(raster.heights, raster.cell_size) if fill_holes else None
-        self.filled = self._holes.share if self._holes else 0.0
+        self.filled = self._holes.count if self._holes else 0
         self._edge = max(min(TILE, int(TILE_CELLS / self._ratio)), 1)
         self._tiles: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._kept = 2 * -(-cols // self._edge) + 2  # two rows of tiles: windows go from west to east

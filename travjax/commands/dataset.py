@@ -2,6 +2,7 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
+from travjax.dem_options import DemOptions
 from travjax.files import output_folder, written_whole
 from travjax.grid import Grid
 from travjax.provenance import SIDES, Site, SitesConfig, Strip
@@ -155,7 +157,7 @@ def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where
 def _sites(arguments: argparse.Namespace) -> SitesConfig:
     """The sites of DEM files."""
     settings = options.dem_settings(arguments)
-    read = {name: settings.pop(name) for name in ("cell_size", "height_scale", "nodata")}
+    read = {field.name: settings.pop(field.name) for field in fields(DemOptions)}
     strips: dict[str, Any] = {
         name: _strip(name, getattr(arguments, name)) for name in ("test_strip", "validation_strip")
     }

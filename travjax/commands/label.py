@@ -5,15 +5,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from travjax import report, traverse
 from travjax.actions import ActionSpace
-from travjax.clouds import SUFFIXES
 from travjax.commands import options
 from travjax.config import require
 from travjax.dem import load_dem
-from travjax.files import output_folder, save_npz, written_whole
+from travjax.files import output_folder, written_whole
+from travjax.formats import OTHERS
 from travjax.grid import Grid
-from travjax.labelling import Batch, dem_batches, joined, labelled, samples, synthetic_batches, title
+from travjax.labelling import Batch, bytes_each, dem_batches, labelled, samples, synthetic_batches, title
+from travjax.npz_stream import NpzStream
 from travjax.robot import Robot
 from travjax.terrain import STYLES
 
@@ -24,8 +27,7 @@ def add(commands: options.Commands) -> None:
         "label",
         help="label every trajectory of synthetic or real maps",
         description="Labels every trajectory of maps with step, obstacle and tilt failures: of synthetic maps, or of "
-        "the windows of elevation maps: GeoTIFF and whatever else GDAL reads, .npy, .npz, and point clouds "
-        f"({', '.join(SUFFIXES)}).",
+        f"the windows of elevation maps: GeoTIFF and other rasters of local pixels that GDAL reads, {OTHERS}.",
     )
     parser.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
     options.add_synthetic(parser, count=200, each="maps in all, the styles in turn")
@@ -43,22 +45,23 @@ def run(arguments: argparse.Namespace) -> None:
     total, source, files = maps_of(arguments, grid)
     out = output_folder(arguments.out)
 
-    batches = (labelled(batch, robot, actions, grid) for batch in source)
-    maps = joined(list(options.progress(batches, total, "labelling")))
-
     as_in_paper = not arguments.dem and traverse.as_in_paper(robot, actions)
-    table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
     config = options.configuration_json(robot, actions, grid, files=files)
-    labels = save_npz(out / "labels.npz", config=config, cell_size=grid.spacing, **maps)
-    with written_whole(out / "shares.txt") as temporary:
-        temporary.write_text(table + "\n")
-    print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
-    unknown = int((~maps["known"].any(axis=-1)).sum())
-    if unknown:
-        print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
-    print(labels, out / "shares.txt", sep="\n")
-    if not arguments.no_figures:
-        _write_figures(maps, robot, actions, grid, out)
+    with NpzStream(out / "labels.npz", total, bytes_each(actions, grid), "labelled maps") as labels:
+        for batch in options.progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling"):
+            labels.append(batch)
+        maps = labels.arrays
+        table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
+        labels.save(config=config, cell_size=grid.spacing)
+        with written_whole(out / "shares.txt") as temporary:
+            temporary.write_text(table + "\n")
+        print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+        unknown = int((~maps["known"].any(axis=-1)).sum())
+        if unknown:
+            print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
+        print(labels.path, out / "shares.txt", sep="\n")
+        if not arguments.no_figures:
+            _write_figures(maps, robot, actions, grid, out)
 
 
 def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
@@ -82,20 +85,25 @@ def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterat
     files, notes = [], []
     for path in arguments.dem:
         windows = load_dem(path, grid=grid, **settings)
-        crs = windows.crs or "none"
-        crs = crs.split('"')[1] if '"' in crs else crs  # of a system without a code, the name
+        systems = dict.fromkeys(windows.systems().tolist())
         print(
-            f"{path}: {len(windows.heights)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
-            f"crs {crs}, {windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
+            f"{path}: {len(windows)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
+            f"crs {', '.join(map(_shown, systems))}, {windows.filled:.3%} filled in small holes, "
+            f"{windows.unknown:.1%} unknown"
         )
+        for note in windows.notes:
+            print(f"{path}: {note}")
         files.append((path.name if names.count(path.name) == 1 else str(path), windows))
-        read = {
-            name: getattr(windows, name)
-            for name in ("path", "sha256", "crs", "height_offset", "covered", "filled", "unknown")
-        }
+        read = {name: getattr(windows, name) for name in ("path", "sha256", "covered", "filled", "unknown", "notes")}
+        read |= {"crs": windows.crs, "height_offset": np.ravel(windows.height_offset).tolist()}
         notes.append(read | settings | {"cell_size": windows.cell_size})
 
-    return sum(len(windows.heights) for _, windows in files), dem_batches(files), notes
+    return sum(len(windows) for _, windows in files), dem_batches(files), notes
+
+
+def _shown(crs: str) -> str:
+    """The code of a system, the name of one without a code."""
+    return crs.split('"')[1] if '"' in crs else crs or "none"
 
 
 def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, out: Path) -> None:

@@ -11,6 +11,7 @@ from tqdm import tqdm
 
 from travjax.actions import ActionSpace
 from travjax.config import InputError, require, to_json
+from travjax.dem_options import AXES_UP
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.labelling import Batch
@@ -46,7 +47,10 @@ def add_grid(parser: argparse._ActionsContainer) -> None:
     )
 
 
-DEM_OPTIONS = ("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse")
+DEM_OPTIONS = (
+    *("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse"),
+    *("band", "classes", "up", "gdal_driver"),
+)
 """What `add_dem` adds; each is None or False where it is not given."""
 
 
@@ -64,10 +68,34 @@ def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
         help="value that marks unknown ground, if the file does not say; as in --nodata=-9999",
     )
     parser.add_argument(
-        "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m of known ground"
+        "--keep-holes", action="store_true", help="do not interpolate holes within 0.125 m, or a cell, of known ground"
     )
     parser.add_argument("--allow-coarse", action="store_true", help="take DEM cells larger than 0.125 m")
+    parser.add_argument(
+        "--band",
+        type=lambda text: int(text) if text.isdigit() else text,
+        metavar="B",
+        help="band of a raster that holds the heights: its number from 1, or its description; of a netCDF file the "
+        "variable, as in z or z:2",
+    )
+    parser.add_argument(
+        "--classes",
+        type=_codes,
+        metavar="C,C",
+        help="classes of LAS points that are ground, as in 2,9 (2 where the file has it beside others, else all)",
+    )
+    parser.add_argument("--up", choices=AXES_UP, help="axis of a point cloud or mesh that points up (z)")
+    parser.add_argument(
+        "--gdal-driver",
+        action="append",
+        metavar="NAME",
+        help="a driver of GDAL that may read files beside those of local pixels; may be given again",
+    )
     parser.set_defaults(default_stride=stride)
+
+
+def _codes(text: str) -> tuple[int, ...]:
+    return tuple(int(code) for code in text.split(","))
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
@@ -98,6 +126,10 @@ def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         "nodata": arguments.nodata,
         "fill_holes": not arguments.keep_holes,
         "allow_coarse": arguments.allow_coarse,
+        "band": arguments.band,
+        "classes": arguments.classes,
+        "up": arguments.up,
+        "gdal_drivers": tuple(arguments.gdal_driver or ()),
     }
 
 
