@@ -566,7 +566,7 @@ def test_an_interruption_is_one_line_and_leaves_nothing_half_written(tmp_path, f
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(label_command, "save_npz", interrupt)
+    monkeypatch.setattr(label_command.NpzStream, "save", interrupt)
     done = run(tmp_path, "label", "--count", 1, "--actions", few, "--no-figures")
     assert done.code == 130
     assert done.err.splitlines()[-1] == "travjax: interrupted"

@@ -1,102 +1,21 @@
-"""Rasters: what resampling keeps and takes away, and what holds for heights, sizes and coordinate systems."""
+"""Rasters: what holds for heights, sizes and cells of every format, and values as metres."""
 
 import numpy as np
 import pytest
-from rasterio.crs import CRS
 
 from travjax.config import InputError
 from travjax.grid import Grid
 from travjax.raster import (
-    Raster,
+    InMetres,
     agreed_cell_size,
-    crs_name,
+    as_stored,
+    marks_nothing,
+    parts,
+    require_fine,
     require_heights,
-    require_metric,
     require_size,
-    resample,
-    without_small_holes,
+    survey,
 )
-
-SPACING = 0.0625
-
-
-def wave(length: float, cell: float, turn: float, size: float = 6.0) -> np.ndarray:
-    """A wave of amplitude 1 m and this length, running `turn` radians from east: [rows, cols], rows a third longer."""
-    x, y = np.meshgrid(cell * np.arange(round(size / cell)), cell * np.arange(round(4 / 3 * size / cell)))
-    return np.sin(2 * np.pi * (np.cos(turn) * x + np.sin(turn) * y) / length)
-
-
-def inside(raster: Raster) -> np.ndarray:
-    """Away from the border, where a wave goes on."""
-    return raster.heights[4:-4, 4:-4]
-
-
-# ---- Anti-aliasing
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.6, np.pi / 2])
-@pytest.mark.parametrize("cell", [0.01, 0.015625, 0.02])
-def test_waves_that_the_new_spacing_cannot_show_are_taken_away(cell, turn):
-    for length in (0.04, 0.05, 0.0625):
-        left = inside(resample(Raster(wave(length, cell, turn), cell), SPACING))
-        assert np.abs(left).max() < 0.2
-        assert abs(left.mean()) < 0.01
-
-
-@pytest.mark.parametrize("turn", [0.0, 0.6, np.pi / 2])
-@pytest.mark.parametrize("cell", [0.01, 0.02, 0.05])
-def test_waves_of_many_nodes_stay(cell, turn):
-    raster = resample(Raster(wave(1.0, cell, turn), cell), SPACING)
-    expected = Raster(wave(1.0, SPACING, turn), SPACING)
-    rows, cols = raster.heights.shape
-    np.testing.assert_allclose(inside(raster), expected.heights[:rows, :cols][4:-4, 4:-4], rtol=0, atol=0.03)
-
-
-def test_picking_values_would_show_a_wave_that_is_not_there():
-    picked = Raster(wave(0.06, 0.0125, 0.0)[::5, ::5], SPACING)
-    assert np.abs(inside(picked)).max() > 0.9
-
-
-@pytest.mark.parametrize("cell", [0.0125, 0.05, 0.0625, 0.1, 0.125])
-def test_resampling_keeps_the_place_of_the_south_west_value(cell):
-    heights = np.arange(100.0)[:, None] * cell + 2 * np.arange(120.0) * cell
-    raster = resample(Raster(heights, cell, (3.0, 4.0), "EPSG:32632"), SPACING)
-    assert (raster.origin, raster.cell_size, raster.crs) == (
-        (3.0, 4.0),
-        SPACING if cell != SPACING else cell,
-        "EPSG:32632",
-    )
-    rows, cols = raster.heights.shape
-    assert (rows - 1) * SPACING <= 99 * cell + 1e-9 < rows * SPACING
-    assert (cols - 1) * SPACING <= 119 * cell + 1e-9 < cols * SPACING
-    expected = np.arange(rows)[:, None] * SPACING + 2 * np.arange(cols) * SPACING
-    np.testing.assert_allclose(inside(raster), expected[4:-4, 4:-4], rtol=0, atol=1e-6)
-
-
-# ---- Holes
-
-
-def test_small_holes_are_filled_and_counted_and_others_stay():
-    heights = 0.3 * np.arange(20.0)[:, None] + 0.1 * np.arange(30.0)
-    holed = heights.copy()
-    holed[5, 5] = holed[8:10, 12:20] = np.nan
-    holed[14:19, 3:8] = np.nan
-    raster, filled = without_small_holes(Raster(holed, SPACING, (1.0, 2.0), "EPSG:32632"))
-    assert filled == pytest.approx(17 / 600)
-    np.testing.assert_allclose(raster.heights[:14], heights[:14], rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(np.isnan(raster.heights[14:]), np.isnan(holed[14:]))
-    assert (raster.cell_size, raster.origin, raster.crs) == (SPACING, (1.0, 2.0), "EPSG:32632")
-
-
-def test_a_raster_without_holes_is_left_alone():
-    whole, wide = np.zeros((20, 20)), np.zeros((20, 20))
-    wide[5:15, 5:15] = np.nan
-    for heights in (whole, wide):
-        raster = Raster(heights, SPACING)
-        assert without_small_holes(raster) == (raster, 0.0)
-
-
-# ---- Checks
 
 
 def line(check, *arguments) -> str:
@@ -135,40 +54,76 @@ def test_a_cell_size_must_agree_with_the_files():
     assert line(agreed_cell_size, 0.0, None).startswith("cell_size = 0.0: must be metres")
 
 
-# ---- Coordinate systems
+def test_coarse_cells_are_refused_unless_allowed():
+    assert line(require_fine, 0.2, False).startswith("cell_size = 0.2: must be at most 0.125 m")
+    require_fine(0.2, True)
+    require_fine(0.125, False)
+
+
+# ---- Values in metres
+
+WHOLE = np.s_[0:2, 0:3]
+
+
+def test_values_become_metres_and_unknown_ones_nan():
+    values = np.array([[1, 2, 3], [4, 5, 6]], ">i2")
+    unknown = np.array([[False, True, False], [False, False, False]])
+    heights = InMetres(values, 0.5, 10.0, unknown, nodata=6)
+    np.testing.assert_array_equal(heights[WHOLE], [[10.5, np.nan, 11.5], [12, 12.5, np.nan]])
+    np.testing.assert_array_equal(heights[1:2, 0:2], [[12, 12.5]])
+    assert heights.shape == (2, 3)
+    assert heights[WHOLE].dtype == np.float64
+
+
+def test_rows_that_run_south_are_turned():
+    heights = InMetres(np.array([[1.0, 2], [3, 4]]), unknown=np.array([[True, False], [False, False]]), southern=False)
+    np.testing.assert_array_equal(heights[0:2, 0:2], [[3, 4], [np.nan, 2]])
 
 
 @pytest.mark.parametrize(
-    ("system", "name"),
-    [("EPSG:32632", "EPSG:32632"), ("EPSG:25832+7837", "EPSG:25832"), ("EPSG:5555", "EPSG:25832")],
-)
-def test_a_system_joined_with_one_of_heights_goes_by_its_own_name(system, name):
-    crs = CRS.from_string(system)
-    require_metric(crs, False)
-    assert crs_name(crs) == name
-
-
-def test_a_system_without_a_code_goes_by_its_text():
-    assert str(crs_name(CRS.from_wkt('LOCAL_CS["yard",UNIT["metre",1]]'))).startswith('LOCAL_CS["yard"')
-    assert crs_name(None) is None
-
-
-@pytest.mark.parametrize(
-    ("system", "start"),
+    ("nodata", "dtype", "stored"),
     [
-        ("EPSG:4326", "crs = EPSG:4326: is in degrees; reproject"),
-        ("EPSG:2263", "crs = EPSG:2263: is in units of 0.3048"),
-        ("EPSG:2263+6360", "crs = EPSG:2263: is in units of 0.3048"),
-        ('LOCAL_CS["yard",UNIT["foot",0.3048]]', 'crs = "yard": is in units of 0.3048 m (foot)'),
+        (65535, "i2", None),
+        (65535, "u2", 65535),
+        (-9999, "u1", None),
+        (0.5, "i4", None),
+        (1e10, "i4", None),
+        (-32768, ">i2", -32768),
+        (-99.9, "f4", np.float32(-99.9)),
+        (1e300, "f4", None),
+        (1e300, "f8", 1e300),
+        (None, "f4", None),
     ],
 )
-@pytest.mark.parametrize("scaled", [True, False])
-def test_degrees_and_feet_are_refused(system, start, scaled):
-    assert line(require_metric, CRS.from_string(system), scaled).startswith(start)
+def test_a_mark_that_the_number_type_cannot_hold_marks_nothing(nodata, dtype, stored):
+    found = as_stored(nodata, np.dtype(dtype))
+    assert (found is None) if stored is None else (found == stored)
+    note = marks_nothing(nodata, np.dtype(dtype))
+    assert bool(note) == (stored is None and nodata is not None)
+    zeros = InMetres(np.zeros((2, 3), dtype), nodata=nodata)[WHOLE]
+    assert not np.isnan(zeros).any()
 
 
-def test_heights_in_feet_are_refused_unless_they_are_scaled():
-    crs = CRS.from_string("EPSG:25832+6360")
-    assert line(require_metric, crs, False).startswith("crs = EPSG:25832: has heights in units of 0.3048")
-    require_metric(crs, True)
-    require_metric(None, False)
+# ---- Reading through
+
+
+def test_parts_are_all_rows_once_with_those_beside_them(monkeypatch):
+    monkeypatch.setattr("travjax.raster.PART", 12)
+    heights = np.arange(44.0).reshape(11, 4)
+    seen = []
+    for rows, own, part in parts(heights, 2):
+        np.testing.assert_array_equal(part[own], heights[rows])
+        assert len(part) == min(rows.stop + 2, 11) - max(rows.start - 2, 0)
+        seen.extend(range(rows.start, rows.stop))
+    assert seen == list(range(11))
+
+
+def test_a_survey_counts_and_measures_what_is_known(monkeypatch):
+    monkeypatch.setattr("travjax.raster.PART", 12)
+    heights = np.arange(44.0).reshape(11, 4)
+    heights[0] = np.nan
+    found = survey(heights)
+    assert (found.known, found.lowest, found.highest, found.median) == (40, 4, 43, 23.5)
+    assert survey(np.full((3, 3), np.nan)).known == 0
+    heights[5, 2] = -9999
+    assert line(survey, heights).startswith("heights = -9999: is a usual mark of unknown ground")

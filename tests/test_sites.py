@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import SETTINGS
+from pyproj import Transformer
 
 from travjax import sites
 from travjax.config import InputError
@@ -127,6 +128,29 @@ def test_nothing_near_a_test_window_is_trained_on(case):
 def test_training_and_validation_share_no_node(case):
     for place, validation in pairs(case, "train", "validation"):
         assert distance(place, validation) > CELL / 2
+
+
+def in_zone(code: int, lon: float, lat: float) -> tuple[float, float]:
+    return Transformer.from_crs("EPSG:4326", f"EPSG:{code}", always_xy=True).transform(lon, lat)
+
+
+@pytest.mark.parametrize("code", [25832, 32633, 25833, 3044])
+@pytest.mark.parametrize(("apart", "left_out"), [(0.0, True), (13.0, True), (60.0, False)])
+def test_the_same_ground_by_another_code_is_not_trained_on(tmp_path, code, apart, left_out):
+    lon, lat = 11.999, 47.0
+    x, y = in_zone(32632, lon, lat)
+    east, north = in_zone(code, lon, lat)
+    files = {
+        "here": str(site_file(tmp_path / "here.npz", 4, 4, (x, y), "EPSG:32632")),
+        "again": str(site_file(tmp_path / "again.npz", 4, 4, (east + apart, north), f"EPSG:{code}", shift=0.1)),
+        "away": str(site_file(tmp_path / "away.npz", 4, 4, (x - 500, y), "EPSG:32632")),
+    }
+    config = config_of(files, ("here", {}), ("again", {"split": "test"}), ("away", {}), rotations=False)
+    if left_out:
+        with pytest.raises(InputError, match="site here: split = train: .* 1 near the test"):
+            made(config)
+    else:
+        assert made(config).split.tolist() == [0, 2, 0]
 
 
 def slow_fates(config: SitesConfig, dataset: Dataset) -> dict[tuple, str]:

@@ -47,4 +47,6 @@ class DemOptions:
                 type(code) is int and 0 <= code < 256 for code in self.classes
             )
             require(codes and bool(self.classes), "classes", self.classes, "codes from 0 to 255, as in (2, 9)")
+        names = isinstance(self.gdal_drivers, tuple) and all(isinstance(name, str) for name in self.gdal_drivers)
+        require(names, "gdal_drivers", self.gdal_drivers, 'names of drivers, as in ("BAG",)')
         require(self.up is None or self.up in AXES_UP, "up", self.up, f"one of {', '.join(AXES_UP)}")

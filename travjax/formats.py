@@ -81,7 +81,7 @@ def form_of(path: Path) -> str:
     for mark, encoding in ENCODINGS.items():
         if head.startswith(mark):
             return encoding if _is_grid(head.decode(encoding, "ignore")) else "text"
-    if b"\0" in head:
+    if re.search(rb"[\x00-\x08\x0e-\x1f]", head):  # no text
         return "raster"
     text = head.decode("latin-1")
     if _is_grid(text):

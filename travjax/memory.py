@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import sys
 from pathlib import Path
 
 from travjax.config import InputError
@@ -12,7 +13,10 @@ CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 def available() -> int:
     """Returns the bytes of memory that may be taken now, as far as the system says."""
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):  # Windows: nothing is known, and nothing refused
+        return sys.maxsize
     try:
         fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
         total = min(total, int(fields["MemAvailable"].split()[0]) * 1024)

@@ -111,7 +111,7 @@ def as_stored(nodata: float | None, dtype: np.dtype) -> np.generic | None:
         limits = np.iinfo(dtype)
         whole = float(nodata).is_integer() and limits.min <= int(nodata) <= limits.max
         return dtype.type(int(nodata)) if whole else None
-    return dtype.type(nodata) if abs(nodata) <= np.finfo(dtype).max else None
+    return dtype.type(nodata) if abs(nodata) <= float(np.finfo(dtype).max) else None
 
 
 def marks_nothing(nodata: float | None, dtype: np.dtype) -> tuple[str, ...]:

@@ -119,7 +119,7 @@ def _opened(name: str, drivers: tuple[str, ...]) -> tuple[Any, bool]:
         except rasterio.errors.RasterioIOError as error:
             reason = _first_line(error.__cause__ or error)
             if "not recognized" in reason:
-                reason += f" (--gdal-driver NAME adds one); beside GDAL's formats: {OTHERS}"
+                reason = f"{reason.rstrip('.')} (--gdal-driver NAME adds one); beside GDAL's formats: {OTHERS}"
             raise InputError(f"not a raster that can be read: {reason}") from None
     missing = any(issubclass(warning.category, rasterio.errors.NotGeoreferencedWarning) for warning in caught)
     return file, not (missing or file.transform.is_identity)

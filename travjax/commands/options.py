@@ -1,6 +1,7 @@
 """What commands share: groups of options, the configurations they make, and progress."""
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -11,7 +12,7 @@ from tqdm import tqdm
 
 from travjax.actions import ActionSpace
 from travjax.config import InputError, require, to_json
-from travjax.dem_options import AXES_UP
+from travjax.dem_options import AXES_UP, DemOptions
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.labelling import Batch
@@ -119,17 +120,19 @@ def seed(arguments: argparse.Namespace) -> int:
 
 def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:
     """How elevation maps are read, as `load_dem` takes it: by keyword, `stride` included."""
-    return {
+    options = DemOptions(
+        arguments.cell_size,
+        arguments.height_scale,
+        arguments.nodata,
+        arguments.band,
+        arguments.classes,
+        arguments.up,
+        tuple(arguments.gdal_driver or ()),
+    )
+    return dataclasses.asdict(options) | {
         "stride": arguments.default_stride if arguments.stride is None else arguments.stride,
-        "cell_size": arguments.cell_size,
-        "height_scale": arguments.height_scale,
-        "nodata": arguments.nodata,
         "fill_holes": not arguments.keep_holes,
         "allow_coarse": arguments.allow_coarse,
-        "band": arguments.band,
-        "classes": arguments.classes,
-        "up": arguments.up,
-        "gdal_drivers": tuple(arguments.gdal_driver or ()),
     }
 
 
