@@ -59,6 +59,7 @@ ORDER = [
     "plots",
     "report",
     "transfer_scores",
+    "robustness_scores",
     "curves",
     "statistics",
     "bench",
