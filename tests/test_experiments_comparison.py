@@ -15,13 +15,13 @@ from training import GRID, HUSKY
 from travjax import curves
 from travjax.dataset import DatasetConfig
 from travjax.experiments import comparison
-from travjax.metrics import OVERALL
+from travjax.metrics import OVERALL, Confusion
 from travjax.model_file import write_model
 from travjax.predictor import Predictor
 from travjax.preset import Preset
 from travjax.provenance import SitesConfig
 from travjax.robustness import CORRUPTIONS, FILTERS, Ground, of_sites
-from travjax.robustness_scores import FILTERED, HAZARD, SIMULATOR, best_filters, compare
+from travjax.robustness_scores import FILTERED, HAZARD, MARGINS, SIMULATOR, best_filters, compare, sites_table
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
@@ -212,8 +212,19 @@ def test_the_table_has_a_row_a_site_and_the_filter_that_was_chosen(done):
             f1.append(scores[results["filters"][name]]["overall"]["f1"])
             assert row[-len(f1) :] == [f"{value:.3f}" for value in f1]
     chosen = results["filters"]
-    assert lines[-1] == "Best filter: " + "; ".join(f"{name}: {chosen[name]}" for name in CORRUPTIONS) + "."
+    assert lines[-2] == "Best filter: " + "; ".join(f"{name}: {chosen[name]}" for name in CORRUPTIONS) + "."
     assert chosen == {name: one["filter"] for name, one in results["maps"].items()}
+
+
+def test_the_table_says_on_how_many_sites_the_field_is_ahead():
+    counts = {"ahead": (5, 2), "behind": (5, 8), "as good": (5, 5), "nothing fails": (0, 2)}
+    other = {OVERALL: Confusion(1, 5, 0, 5)}
+    sites = {}
+    for site, (tp, fp) in counts.items():
+        methods = dict.fromkeys((*FILTERS, MARGINS), other) | {HAZARD: {OVERALL: Confusion(1, fp, 0, tp)}}
+        sites[site] = dict.fromkeys(CORRUPTIONS, methods)
+    last = sites_table(sites, dict.fromkeys(CORRUPTIONS, "no filter")).splitlines()[-1]
+    assert last.endswith(": " + "; ".join(f"{name}: 1 of 3" for name in CORRUPTIONS) + ".")
 
 
 def test_the_report_says_what_the_real_ground_is(done):

@@ -273,7 +273,7 @@ def _on_real_ground(
     )
     table = sites_table(scores, chosen)
     with written_whole(out / "sites.txt") as temporary:
-        temporary.write_text(table + "\n")
+        temporary.write_text(f"{headline}\n\n{table}\n")
     f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
     figure = plots.save(curves.sites_figure(f1, IN_FIGURE), out / "sites.png")
     numbers = {
