@@ -11,10 +11,13 @@ from field_runs import CONFIG, begun
 from training import copy, dataset, host, require_equal
 
 from travjax.checkpoint import load_meta
+from travjax.commands.export import card
 from travjax.estimator import take_apart
 from travjax.model_file import read_model
-from travjax.predictor import Predictor
+from travjax.predictor import DEFAULT, WEIGHTS, Predictor
 from travjax.trained import load_estimator
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -80,16 +83,16 @@ def test_the_file_predicts_as_the_run_does(field, tmp_path):
 
 def test_the_card_says_what_it_was_trained_on(field, tmp_path):
     exported(field, tmp_path / "it.safetensors", "--checkpoint", "latest")
-    card = (tmp_path / "it.md").read_text()
-    assert card.startswith("# it.safetensors\n")
+    said = (tmp_path / "it.md").read_text()
+    assert said.startswith("# it.safetensors\n")
     count = sum(leaf.size for leaf in jax.tree.leaves(take_apart(load_estimator(field)[1])[1]))
-    assert row(card, "estimator") == f"field, {count:,} parameters" and CONFIG.hidden == 8
-    assert row(card, "robot").startswith("Husky A200; ")
-    assert row(card, "maps") == f"4 x 4 m at 0.125 m, {len(FEW)} trajectories"
+    assert row(said, "estimator") == f"field, {count:,} parameters" and CONFIG.hidden == 8
+    assert row(said, "robot").startswith("Husky A200; ")
+    assert row(said, "maps") == f"4 x 4 m at 0.125 m, {len(FEW)} trajectories"
     wanted = f"30 synthetic maps of seed 5 (fingerprint {dataset().fingerprint}), seed 0, 10 steps"
-    assert row(card, "trained on") == wanted
-    assert row(card, "corrupted").startswith("50% of the maps: noise up to 0.02 m")
-    assert "not evaluated: `travjax evaluate` writes the tables" in card
+    assert row(said, "trained on") == wanted
+    assert row(said, "corrupted").startswith("50% of the maps: noise up to 0.02 m")
+    assert "not evaluated: `travjax evaluate` writes the tables" in said
 
 
 def test_the_card_holds_the_tables_of_the_evaluation(field, tmp_path):
@@ -97,8 +100,29 @@ def test_the_card_holds_the_tables_of_the_evaluation(field, tmp_path):
     (folder / "evaluation").mkdir()
     (folder / "evaluation/tables.txt").write_text("F1 of everything\n0.5\n")
     exported(folder, tmp_path / "it.safetensors")
-    card = (tmp_path / "it.md").read_text()
-    assert "```\nF1 of everything\n0.5\n```" in card and "not evaluated" not in card
+    said = (tmp_path / "it.md").read_text()
+    assert "```\nF1 of everything\n0.5\n```" in said and "not evaluated" not in said
+
+
+def test_the_card_of_a_hazard_field_holds_what_was_measured_on_real_ground(field, tmp_path):
+    folder = copy(field, tmp_path / "run")
+    exported(folder, tmp_path / "it.safetensors")
+    said = (tmp_path / "it.md").read_text()
+    assert "## Beside the simulator, on real ground" in said and "Not measured: `python -m " in said
+    (folder / "comparison").mkdir()
+    (folder / "comparison/sites.txt").write_text("F1 on a hill\n0.4\n")
+    exported(folder, tmp_path / "again.safetensors")
+    said = (tmp_path / "again.md").read_text()
+    assert "```\nF1 on a hill\n0.4\n```\n\nLimits: " in said and "Not measured" not in said
+
+
+def test_the_card_of_the_estimator_that_comes_with_the_package_holds_what_is_recorded():
+    trained, _, notes = read_model(WEIGHTS / f"{DEFAULT}.safetensors")
+    tables, real = (
+        (EXPERIMENTS / name).read_text().strip()
+        for name in ("field/laptop/evaluation/tables.txt", "comparison/real/sites.txt")
+    )
+    assert (WEIGHTS / f"{DEFAULT}.md").read_text() == card(trained, notes, f"{DEFAULT}.safetensors", tables, real)
 
 
 def test_a_resnet_is_exported_too(trained, tmp_path):
@@ -106,7 +130,8 @@ def test_a_resnet_is_exported_too(trained, tmp_path):
     run, network, notes = read_model(tmp_path / "it.safetensors")
     assert run.preset.model == "resnet50" and notes["step"] == 14
     require_equal(host(take_apart(network)[1]), host(take_apart(load_estimator(trained, "heads")[1])[1]))
-    assert row((tmp_path / "it.md").read_text(), "estimator").startswith("resnet50, ")
+    said = (tmp_path / "it.md").read_text()
+    assert row(said, "estimator").startswith("resnet50, ") and "Beside the simulator" not in said
 
 
 # ---- Bad input

@@ -68,6 +68,7 @@ ORDER = [
     "plots",
     "report",
     "transfer_scores",
+    "robustness_scores",
     "curves",
     "statistics",
     "bench",

@@ -231,6 +231,42 @@ def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
     return figure
 
 
+OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
+"""Colours that the colour-blind can tell apart (Okabe and Ito 2008)."""
+
+
+def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
+    """F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
+
+    f1:      by site, method and corruption: "none", "noise 2 cm", or another
+    methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
+    """
+    names = list(next(iter(next(iter(f1.values())).values())))
+    clean, noisy = names[0], [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    figure = Figure(figsize=(2.9 * len(f1) + 0.6, 6.2), layout="constrained")
+    axes = figure.subplots(2, len(f1), sharey=True, squeeze=False)
+    styles = list(zip(methods, OKABE_ITO, "osv^DP", cycle(("-", "--", "-.", ":")), strict=False))
+    for (upper, lower), (site, of) in zip(axes.T, f1.items(), strict=True):
+        for number, (method, colour, marker, line) in enumerate(styles):
+            style = dict(color=colour, marker=marker, markersize=5)
+            values = [of[method][name] for name in (clean, *noisy)]
+            upper.plot(noises, values, linestyle=line, label=methods[method], **style)
+            aside = np.arange(len(others)) + 0.16 * (number - (len(styles) - 1) / 2)
+            lower.plot(aside, [of[method][name] for name in others], linestyle="none", **style)
+        upper.set(title=site, xlabel="noise at each node [cm]", xlim=(-0.25, max(noises) + 0.25), ylim=(0, 1.05))
+        lower.set(xlim=(-0.5, len(others) - 0.5))
+        words = [name.replace(" missing", "\nmissing") if name != clean else "clean" for name in others]
+        lower.set_xticks(range(len(others)), words)
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(styles), fontsize=9)
+    return figure
+
+
 def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
     """F1 against the time for all trajectories of a map.
 

@@ -4,22 +4,23 @@ A method turns maps [n, rows, cols] into scores of failure [n, t, 3], of which 0
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from travjax import corruption
+from travjax import corruption, sites
 from travjax.actions import ActionSpace
 from travjax.dataset import DatasetConfig
 from travjax.estimator import take_apart
 from travjax.grid import Grid
-from travjax.labelling import joined, labelled, synthetic_batches
+from travjax.labelling import Batch, joined, labelled, synthetic_batches
 from travjax.metrics import NAMES, OVERALL, Confusion, average_precision, confusions
 from travjax.parallel import Devices
 from travjax.prediction import logits_of, probabilities
 from travjax.predictor import Predictor
+from travjax.provenance import SitesConfig
 from travjax.robot import Robot
 from travjax.sampling import Samples
 from travjax.traverse import EVENTS, simulate
@@ -71,10 +72,14 @@ FILTERS: dict[str, Callable[[Maps], Maps]] = {
 class Ground:
     """Clean maps and what the simulator says of them.
 
-    heights: [n, rows, cols] metres, none unknown; failed: [n, t, 3]; margins: [n, t, 3] metres, metres, radians
+    heights: [n, rows, cols] metres, none unknown: what was unknown has the height of the nearest known node
+    known:   [n, t] whether a trajectory touches known ground alone; the others count in no score
+    failed:  [n, t, 3]
+    margins: [n, t, 3] metres, metres, radians, NaN where unknown
     """
 
     heights: Maps
+    known: Bool[np.ndarray, "n t"]
     failed: Bool[np.ndarray, "n t 3"]
     margins: Float[np.ndarray, "n t 3"]
     robot: Robot
@@ -95,9 +100,18 @@ class Ground:
         for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), grid):
             batches.append(labelled(batch, robot, actions, grid))
             on_progress(len(batch["heights"]))
-        maps = joined(batches)
+        return Ground._of(joined(batches), robot, actions, grid)
+
+    @staticmethod
+    def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
+        """Windows of real maps; heights: NaN unknown."""
+        return Ground._of(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
+
+    @staticmethod
+    def _of(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
         margins = np.stack([maps[event] for event in EVENTS], axis=-1)
-        return Ground(maps["heights"], maps["failed"], margins, robot, actions, grid)
+        heights = corruption.filled(maps["heights"])
+        return Ground(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
 
     def seen(self, name: str, seed: int) -> Maps:
         """The maps with a corruption of CORRUPTIONS, the same each time."""
@@ -113,9 +127,37 @@ class Ground:
         """The one of FILTERS after which the simulator has the largest F1 on these maps, corrupted as they are."""
         scores = {}
         for name, smooth in FILTERS.items():
-            scores[name] = score(self.simulated(smooth(maps)), self.failed).f1
+            scores[name] = self.scores(self.simulated(smooth(maps)))[OVERALL].f1
             on_progress(1)
         return max(scores, key=lambda name: scores[name])
+
+    def scores(self, fails: Fails, threshold: float = 0.5) -> dict[str, Confusion]:
+        """The confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, 3]."""
+        return scores(fails[self.known], self.failed[self.known], threshold)
+
+
+def of_sites(
+    config: SitesConfig,
+    most: int,
+    seed: int,
+    robot: Robot,
+    actions: ActionSpace,
+    grid: Grid,
+    on_progress: Progress = lambda count: None,
+) -> dict[str, Ground]:
+    """The windows of each site by its name: all that are known well enough, or `most` drawn at random.
+
+    config: its splits and turns are left aside; on_progress: is told of windows that were read
+    Raises InputError when a file is missing, cannot be read or leaves no window.
+    """
+    whole = (replace(site, split="test", test_strip=(), validation_strip=()) for site in config.site)
+    data = sites.read(replace(config, site=tuple(whole), rotations=False), robot, actions, grid, on_progress)
+    grounds = {}
+    for number, site in enumerate(config.site):
+        own, rng = np.flatnonzero(data.group == site.group), np.random.default_rng((seed, number))
+        chosen = np.sort(rng.choice(own, min(most, len(own)), replace=False))
+        grounds[site.group] = Ground.real(data.heights[chosen], robot, actions, grid)
+    return grounds
 
 
 def by_margins(margins: Float[np.ndarray, "n t 3"], robot: Robot) -> Fails:
@@ -129,11 +171,6 @@ def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: 
     graph, variables = take_apart(predictor.network)
     variables, source = devices.replicate(variables), devices.replicate(predictor.run.source(maps))
     return probabilities(logits_of(graph, variables, source, samples, devices, 64 * devices.mesh.size, on_progress))
-
-
-def score(fails: Fails, failed: Bool[np.ndarray, "*k 3"]) -> Confusion:
-    """All events pooled, at 0.5."""
-    return scores(fails, failed)[OVERALL]
 
 
 def scores(fails: Fails, failed: Bool[np.ndarray, "*k 3"], threshold: float = 0.5) -> dict[str, Confusion]:

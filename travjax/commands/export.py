@@ -2,11 +2,15 @@
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from travjax.commands import options
 from travjax.config import InputError
 from travjax.files import written_whole
 from travjax.models import FIELD
+
+if TYPE_CHECKING:
+    from travjax.trained import Run
 
 
 def add(commands: options.Commands) -> None:
@@ -35,24 +39,35 @@ def run(arguments: argparse.Namespace) -> None:
     notes = {"dataset": meta["dataset"], "epoch": position["epoch"], "step": position["total"]}
     write_model(arguments.to, trained, network, notes)
     print(arguments.to)
-    card = arguments.to.with_suffix(".md")
-    with written_whole(card) as temporary:
-        temporary.write_text(_card(arguments.folder, trained, notes, arguments.to.name))
-    print(card)
+    path = arguments.to.with_suffix(".md")
+    tables, real = (_text(arguments.folder / name) for name in ("evaluation/tables.txt", "comparison/sites.txt"))
+    with written_whole(path) as temporary:
+        temporary.write_text(card(trained, notes, arguments.to.name, tables, real))
+    print(path)
 
 
-def _card(folder: Path, trained, notes: dict, name: str) -> str:
-    """What the estimator is for, how it was made, and how good it is."""
+def _text(path: Path) -> str | None:
+    return path.read_text().strip() if path.exists() else None
+
+
+def card(trained: "Run", notes: dict, name: str, tables: str | None, real: str | None) -> str:
+    """What the estimator is for, how it was made, how good it is, and for a hazard field where it is worth using.
+
+    notes:  of the model file
+    name:   of the model file
+    tables: of `travjax evaluate`, if it was run
+    real:   the table of real ground of the comparison, if it was run
+    """
     import jax
 
-    preset, tables = trained.preset, folder / "evaluation" / "tables.txt"
-    grid, actions, seen = trained.grid, trained.actions, preset.corruption
+    preset, grid = trained.preset, trained.grid
+    seen, field = preset.corruption, preset.model == FIELD
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
-    measured = tables.read_text().strip() if tables.exists() else "not evaluated: `travjax evaluate` writes the tables"
-    field = preset.model == FIELD
+    measured = tables or "not evaluated: `travjax evaluate` writes the tables"
     corrupted = (
         f"| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
     )
+    beside_simulator = _beside_simulator(real)
     margins = "Regressed margins are not told apart above four times a limit. "
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"
     return f"""# {name}
@@ -63,7 +78,7 @@ Predicts which trajectories of a wheeled robot fail on an elevation map, and by 
 |---|---|
 | estimator | {preset.model}, {parameters:,} parameters |
 | robot | {trained.robot.name}; another one needs training: `travjax train PRESET --robot FILE` |
-| maps | {grid.size:g} x {grid.size:g} m at {grid.spacing:g} m, {len(actions)} trajectories |
+| maps | {grid.size:g} x {grid.size:g} m at {grid.spacing:g} m, {len(trained.actions)} trajectories |
 | trained on | {data} (fingerprint {notes["dataset"]}), seed {preset.training.seed}, {notes["step"]:,} steps |
 {corrupted * field}
 ## Evaluation
@@ -71,7 +86,21 @@ Predicts which trajectories of a wheeled robot fail on an elevation map, and by 
 ```
 {measured}
 ```
-
+{beside_simulator * field}
 Limits: labels are those of a kinematic simulator on synthetic terrain, without friction, dynamics or soft ground.
 {margins * field}Do not let it drive a robot unwatched.
+"""
+
+
+def _beside_simulator(table: str | None) -> str:
+    """The card's section on where a hazard field is worth using, as the simulator takes the same maps."""
+    command = "python -m travjax.experiments.comparison --ground real --field RUN --out RUN/comparison"
+    measured = f"```\n{table}\n```" if table else f"Not measured: `{command}` does it; `--sites` takes ground of yours."
+    return f"""
+## Beside the simulator, on real ground
+
+On a clean map the simulator (`travjax label`) is exact. A noisy map can be smoothed before it is simulated. Whether the
+simulator or this estimator is then nearer to the labels of the clean map depends on the ground and on the noise.
+
+{measured}
 """

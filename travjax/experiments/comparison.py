@@ -1,7 +1,8 @@
 """`python -m travjax.experiments.comparison`: simulators and estimators by quality, time and robustness.
 
 On its own map the simulator is exact; on a noisy one it is not, and an estimator trained on such maps can be better.
-The recorded run is under experiments/comparison.
+Whether it is depends on the ground: synthetic maps and each real site have rows of their own. The recorded runs are
+under experiments/comparison.
 """
 
 import argparse
@@ -10,28 +11,45 @@ import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from travjax import bench, curves, metrics, plots
-from travjax.config import require
+from travjax.config import InputError, require, to_json
 from travjax.experiments import launch, timing
-from travjax.files import output_folder, written_whole
-from travjax.metrics import NAMES, OVERALL
+from travjax.files import find_data, output_folder, written_whole
+from travjax.metrics import OVERALL
 from travjax.models import FIELD, RESNET
 from travjax.predictor import Predictor
+from travjax.provenance import SitesConfig
 from travjax.report import rows_table
 from travjax.resnet import ResNetConfig
-from travjax.robustness import CLEAN, CORRUPTIONS, FILTERS, Ground, average_precisions, by_margins, of_samples, scores
-from travjax.sampling import Samples
+from travjax.robustness import CLEAN, CORRUPTIONS, Ground, of_sites
+from travjax.robustness_scores import (
+    FILTERED,
+    HAZARD,
+    IN_FIGURE,
+    NETWORK,
+    SiteScores,
+    best_filters,
+    compare,
+    f1_of,
+    f1_of_site,
+    on_sites,
+    quality_table,
+    shown,
+    sites_table,
+)
 from travjax.training_step import LARGE_MARGIN
 from travjax.traverse import EVENTS
 
-SIMULATOR, FILTERED = "simulator", "simulator, best filter"
-HAZARD, MARGINS, NETWORK = "hazard field", "hazard field, margins", "ResNet50"
-METHODS = (SIMULATOR, FILTERED, HAZARD, MARGINS, NETWORK)
+SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
+
+SITES = Path("experiments/transfer/sites.toml")
+"""The real ground unless another is given."""
 
 SEED = 20_251_125
 """Of the test maps, the validation maps having the next one.
@@ -40,12 +58,9 @@ A data set draws its terrain seeds from its own seed and size together, so that 
 maps. Presets have seed 0: none of their maps is among these, nor is a test map among the validation maps.
 """
 
-RECALL = 0.97
-"""For which a threshold is chosen on validation maps."""
-
 DESCRIPTION = (
     "Compares the simulators, the hazard field and a ResNet50: quality, time for all trajectories of a map, and F1 on "
-    "maps with noise, missing nodes and at half the resolution."
+    "maps with noise, missing nodes and at half the resolution, of synthetic ground and of real sites."
 )
 
 MEANING = (
@@ -54,6 +69,12 @@ MEANING = (
     "maps are every second node with the others interpolated. *Best filter* is the one of none, a 3 x 3 median and "
     "Gaussians of 0.5 to 2 nodes with the largest F1 on other maps with the same corruption. F1 at 0.5, the events "
     "pooled."
+)
+
+MEANING_REAL = (
+    "In the table of real ground a row is a site, and its clean map is the site's own as it was read, whatever noise "
+    "is in that already. Nodes that are unknown there have the height of the nearest known one, for every method, and "
+    "trajectories that touch them do not count. Gaussians are given in nodes."
 )
 
 
@@ -67,10 +88,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="folder of a run, or .safetensors file, of a hazard field (the package's)",
     )
     parser.add_argument("--resnet", type=Path, metavar="RUN", help="folder of a ResNet50's run (left out)")
-    parser.add_argument("--maps", type=int, default=200, metavar="N", help="test maps (200)")
     parser.add_argument(
-        "--validation-maps", type=int, default=50, metavar="N", help="maps that filters are chosen on (50)"
+        "--ground", choices=GROUNDS, default=BOTH, help=f"what is compared on; times with {SYNTHETIC} ground ({BOTH})"
     )
+    parser.add_argument("--maps", type=int, default=200, metavar="N", help="synthetic test maps (200)")
+    parser.add_argument(
+        "--validation-maps", type=int, default=50, metavar="N", help="synthetic maps that filters are chosen on (50)"
+    )
+    parser.add_argument(
+        "--sites",
+        type=Path,
+        metavar="FILE",
+        help=f"TOML file of the real sites, whose splits play no part ({SITES}, where its files are found)",
+    )
+    parser.add_argument("--windows", type=int, default=100, metavar="N", help="windows of a site, at most (100)")
     parser.add_argument(
         "--samples",
         type=int,
@@ -92,24 +123,34 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and writes tables, figures, JSON and the report."""
-    for name in ("maps", "validation_maps", "samples", "repeats"):
+    for name in ("maps", "validation_maps", "windows", "samples", "repeats"):
         require(getattr(arguments, name) > 0, f"--{name.replace('_', '-')}", getattr(arguments, name), "at least 1")
     require(0 <= arguments.seed < 2**62, "--seed", arguments.seed, "a whole number from 0 to 2^62 - 1")
+    wanted = arguments.ground
+    require(wanted != REAL or not arguments.resnet, "--resnet", str(arguments.resnet), f"left out on {REAL} ground")
+    require(wanted != SYNTHETIC or not arguments.sites, "--sites", str(arguments.sites), "left out on synthetic ground")
     field = _load("--field", arguments.field, FIELD)
     resnet = _load("--resnet", arguments.resnet, RESNET) if arguments.resnet else None
     trained = field.run
     if resnet:
         resnet.require_same(trained.robot, trained.actions, trained.grid)
+    sites = _sites(arguments.sites, wanted)
     out = output_folder(arguments.out)
-    counts = {"test": arguments.maps, "validation": arguments.validation_maps}
-    grounds = {}
-    for number, (what, count) in enumerate(counts.items()):
-        with tqdm(desc=f"{what} maps", total=count, unit="map") as bar:
-            named = (trained.robot, trained.actions, trained.grid)
-            grounds[what] = Ground.synthetic(count, arguments.seed + number, *named, bar.update)
-    results = compare(grounds["test"], grounds["validation"], field, resnet, arguments.samples, arguments.seed)
-    rows = times(field, resnet, arguments.repeats)
-    _write(results, rows, grounds, field, arguments, out)
+    seed, named = arguments.seed, (trained.robot, trained.actions, trained.grid)
+    real, parts = {}, []
+    if sites:
+        with tqdm(desc="windows of sites", unit="window") as bar:
+            real = of_sites(sites, arguments.windows, seed, *named, bar.update)
+    validation = _synthetic("validation", arguments.validation_maps, seed + 1, field)
+    chosen = best_filters(validation, seed)
+    if wanted != REAL:
+        test = _synthetic("test", arguments.maps, seed, field)
+        results = compare(test, validation, field, resnet, arguments.samples, chosen, seed)
+        rows = times(field, resnet, arguments.repeats)
+        parts.append(_on_synthetic_ground(results, rows, field, arguments, out))
+    if sites:
+        parts.append(_on_real_ground(on_sites(real, field, seed), real, chosen, sites, field, arguments, out))
+    _write(parts, out)
 
 
 def _load(option: str, source: Path | None, model: str) -> Predictor:
@@ -118,62 +159,26 @@ def _load(option: str, source: Path | None, model: str) -> Predictor:
     return predictor
 
 
-def compare(
-    test: Ground, validation: Ground, field: Predictor, resnet: Predictor | None, samples: int, seed: int = SEED
-) -> dict:
-    """For every corruption: the filter, and for every method its confusions and average precisions."""
-    results: dict[str, dict] = {}
-    chosen = _drawn(test, samples, seed)
-    methods = 3 + len(FILTERS) + (resnet is not None)
-    with tqdm(desc="corruptions", total=len(CORRUPTIONS) * methods, unit="method") as bar:
-        for name in CORRUPTIONS:
-            seen = test.seen(name, seed)
-            best = validation.best_filter(validation.seen(name, seed + 1), bar.update)
-            predicted = field.predict(seen)
-            found = {
-                SIMULATOR: (test.simulated(seen), test.failed),
-                FILTERED: (test.simulated(FILTERS[best](seen)), test.failed),
-                HAZARD: (predicted.probability, test.failed),
-                MARGINS: (by_margins(_margins(predicted.margins), test.robot), test.failed),
-            }
-            bar.update(3)
-            if resnet:
-                found[NETWORK] = (of_samples(resnet, seen, chosen), test.failed[chosen])
-                bar.update()
-            results[name] = {"filter": best, "methods": {method: _scored(*pair) for method, pair in found.items()}}
-            if name == CLEAN:
-                results[name] |= _on_clean_maps(test, validation, field, predicted)
-    return results
+def _sites(given: Path | None, ground: str) -> SitesConfig | None:
+    """The sites to compare on; None, and a line that says why, where those of the experiment are not at hand."""
+    if ground == SYNTHETIC:
+        return None
+    try:
+        sites = SitesConfig.load(given or SITES)
+        for site in sites.site:
+            find_data(site.file, f"site {site.group}: file")
+    except InputError as error:
+        if given or ground == REAL:
+            raise
+        print(f"Synthetic ground alone: {error}")
+        return None
+    return sites
 
 
-def _margins(margins: np.ndarray | None) -> np.ndarray:
-    assert margins is not None  # the hazard field has them
-    return margins
-
-
-def _drawn(test: Ground, samples: int, seed: int) -> Samples:
-    """Random trajectories of all maps, for what is too slow for all of them."""
-    rng = np.random.default_rng(seed)
-    maps, trajectories = test.failed.shape[:2]
-    places = np.sort(rng.choice(maps * trajectories, min(samples, maps * trajectories), replace=False))
-    return places // trajectories, places % trajectories
-
-
-def _scored(fails: np.ndarray, failed: np.ndarray) -> dict:
-    return {"confusion": scores(fails, failed), "average_precision": average_precisions(fails, failed)}
-
-
-def _on_clean_maps(test: Ground, validation: Ground, field: Predictor, predicted) -> dict:
-    """The threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
-    probability = field.predict(validation.heights).probability
-    threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
-    largest = LARGE_MARGIN * np.asarray(test.robot.limits)
-    off = np.minimum(predicted.margins, largest) - np.minimum(test.margins, largest)
-    return {
-        "threshold": threshold,
-        "at_threshold": scores(predicted.probability, test.failed, threshold),
-        "margin_errors": dict(zip(EVENTS, np.abs(off).mean(axis=(0, 1)).tolist(), strict=True)),
-    }
+def _synthetic(what: str, count: int, seed: int, field: Predictor) -> Ground:
+    trained = field.run
+    with tqdm(desc=f"{what} maps", total=count, unit="map") as bar:
+        return Ground.synthetic(count, seed, trained.robot, trained.actions, trained.grid, bar.update)
 
 
 def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict]:
@@ -198,66 +203,36 @@ def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict
     return rows
 
 
-QUALITY = {"method": "clean maps", "event": "", "recall": "recall", "precision": "precision", "f1": "F1", "ap": "AP"}
+@dataclass(frozen=True)
+class Part:
+    """What is said of one kind of ground.
+
+    text:    paragraphs of the report
+    tables:  by title
+    numbers: for results.json
+    files:   that were written, figures among them
+    """
+
+    text: list[str]
+    tables: dict[str, str]
+    numbers: dict[str, Any]
+    files: list[Path]
 
 
-def _quality_rows(clean: dict) -> list[dict]:
-    rows = []
-    for method, scored in clean["methods"].items():
-        if method == FILTERED:
-            continue
-        for event in NAMES:
-            confusion, precision = scored["confusion"][event], scored["average_precision"][event]
-            rows.append(_quality(method if event == NAMES[0] else "", event, confusion, precision))
-    for event in NAMES:
-        name = f"{HAZARD} at {clean['threshold']:.3f}" if event == NAMES[0] else ""
-        rows.append(_quality(name, event, clean["at_threshold"][event], math.nan))
-    return rows
-
-
-def _quality(method: str, event: str, confusion: metrics.Confusion, precision: float) -> dict:
-    figures = {"recall": confusion.recall, "precision": confusion.precision, "f1": confusion.f1, "ap": precision}
-    return {"method": method, "event": event} | {key: _shown(value) for key, value in figures.items()}
-
-
-def _shown(value: float) -> str:
-    return "-" if math.isnan(value) else f"{value:.3f}"
-
-
-def _f1(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
-    """Of every method on every corruption."""
-    return {
-        method: {name: one["methods"][method]["confusion"][OVERALL].f1 for name, one in results.items()}
-        for method in METHODS
-        if method in results[CLEAN]["methods"]
-    }
-
-
-def _write(
-    results: dict,
-    rows: list[dict],
-    grounds: Mapping[str, Ground],
-    field: Predictor,
-    arguments: argparse.Namespace,
-    out: Path,
-) -> None:
-    """Prints the tables, and writes them with figures and JSON."""
-    f1, clean = _f1(results), results[CLEAN]
+def _on_synthetic_ground(
+    results: dict, rows: list[dict], field: Predictor, arguments: argparse.Namespace, out: Path
+) -> Part:
+    f1, clean = f1_of(results), results[CLEAN]
     columns = {"method": "F1", **{name: name for name in results}}
-    noisy = [{"method": method} | {name: _shown(value) for name, value in of.items()} for method, of in f1.items()]
+    noisy = [{"method": method} | {name: shown(value) for name, value in of.items()} for method, of in f1.items()]
     noisy.append({"method": "the best filter"} | {name: one["filter"] for name, one in results.items()})
     errors = clean["margin_errors"]
     margins = (
         f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: step "
         f"{errors['step']:.4f} m, obstacle {errors['obstacle']:.4f} m, tilt {math.degrees(errors['tilt']):.2f} degrees."
     )
-    tables = {
-        "Quality": rows_table(_quality_rows(clean), QUALITY) + f"\n\n{margins}",
-        "Maps as sensors see them": rows_table(noisy, columns),
-        "Time": rows_table(rows, timing.COLUMNS),
-    }
     headline = (
-        f"{field.run.robot.name}, {len(grounds['test'].heights)} test maps and {len(grounds['validation'].heights)} "
+        f"{field.run.robot.name}, {arguments.maps} test maps and {arguments.validation_maps} "
         f"validation maps that no preset trains on, {len(field.run.actions)} trajectories each, seed {arguments.seed}; "
         f"{bench.machine()}."
     )
@@ -265,22 +240,66 @@ def _write(
     if network:
         drawn = network["confusion"][OVERALL].samples // len(EVENTS)
         headline += f" The {NETWORK}'s scores are of {drawn:,} random trajectories, the others' of all."
-    for title, table in tables.items():
-        print(f"\n{title}\n{table}")
-    print()
-    with written_whole(out / "results.json") as temporary:
-        text = json.dumps({"maps": metrics.to_json(results), "times": metrics.to_json(rows)}, indent=1, allow_nan=False)
-        temporary.write_text(text + "\n")
     with written_whole(out / "f1.tsv") as temporary:
         lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
         temporary.write_text("\n".join(lines) + "\n")
-    figures = [plots.save(curves.robustness_figure(f1), out / "robustness.png")]
     seconds = {row["what"]: row["seconds"] for row in rows}
-    figures.append(plots.save(curves.quality_figure(_points(f1, seconds)), out / "quality.png"))
-    pieces: list[launch.Piece] = [headline, MEANING]
-    pieces += [f"## {title}\n\n{launch.verbatim(table)}" for title, table in tables.items()]
-    report = launch.write_report(out, "Simulators and estimators", [*pieces, *figures])
-    print(report, out / "results.json", out / "f1.tsv", *figures, sep="\n")
+    figures = {"robustness": curves.robustness_figure(f1), "quality": curves.quality_figure(_points(f1, seconds))}
+    tables = {
+        "Quality": f"{quality_table(clean)}\n\n{margins}",
+        "Maps as sensors see them": rows_table(noisy, columns),
+        "Time": rows_table(rows, timing.COLUMNS),
+    }
+    numbers = {"maps": metrics.to_json(results), "times": metrics.to_json(rows)}
+    files = [plots.save(figure, out / f"{name}.png") for name, figure in figures.items()]
+    return Part([headline, MEANING], tables, numbers, [out / "f1.tsv", *files])
+
+
+def _on_real_ground(
+    scores: Mapping[str, SiteScores],
+    real: Mapping[str, Ground],
+    chosen: Mapping[str, str],
+    config: SitesConfig,
+    field: Predictor,
+    arguments: argparse.Namespace,
+    out: Path,
+) -> Part:
+    windows = ", ".join(f"{len(ground.heights)} of {site}" for site, ground in real.items())
+    size = field.run.grid.size
+    headline = (
+        f"{field.run.robot.name}, windows of {size:g} x {size:g} m, at most {config.max_unknown:.0%} of each unknown: "
+        f"{windows}; {len(field.run.actions)} trajectories each. Filters are chosen on {arguments.validation_maps} "
+        f"synthetic maps. Seed {arguments.seed}."
+    )
+    table = sites_table(scores, chosen)
+    with written_whole(out / "sites.txt") as temporary:
+        temporary.write_text(f"{headline}\n\n{table}\n")
+    f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
+    figure = plots.save(curves.sites_figure(f1, IN_FIGURE), out / "sites.png")
+    numbers = {
+        "sites": to_json(config),
+        "windows": {site: len(ground.heights) for site, ground in real.items()},
+        "filters": dict(chosen),
+        "real": metrics.to_json(scores),
+    }
+    return Part([headline, MEANING, MEANING_REAL], {"Real ground": table}, numbers, [out / "sites.txt", figure])
+
+
+def _write(parts: Sequence[Part], out: Path) -> None:
+    """Prints the tables, and writes the report and all numbers as JSON."""
+    pieces: list[launch.Piece] = []
+    for part in parts:
+        for title, table in part.tables.items():
+            print(f"\n{title}\n{table}")
+        pieces += [text for text in part.text if text not in pieces]
+        pieces += [f"## {title}\n\n{launch.verbatim(table)}" for title, table in part.tables.items()]
+        pieces += [path for path in part.files if path.suffix == ".png"]
+    print()
+    with written_whole(out / "results.json") as temporary:
+        numbers = {name: value for part in parts for name, value in part.numbers.items()}
+        temporary.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
+    report = launch.write_report(out, "Simulators and estimators", pieces)
+    print(report, out / "results.json", *(path for part in parts for path in part.files), sep="\n")
 
 
 def _points(
