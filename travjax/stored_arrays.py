@@ -123,7 +123,7 @@ def stored_npy(archive: zipfile.ZipFile, info: zipfile.ZipInfo, kind: str) -> St
     with reading(kind), archive.open(info) as file:
         shape, _, dtype = readers[np.lib.format.read_magic(file)](file)
         claimed = file.tell() + math.prod(shape) * dtype.itemsize
-    if claimed != info.file_size and not dtype.hasobject:
+    if not dtype.hasobject and (claimed != info.file_size or min(shape, default=0) < 0):
         raise InputError(
             f"{shown(info.filename)} = {list(shape)}, {claimed:,} bytes: must be as long as it is stored, "
             f"{info.file_size:,} bytes"
