@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from commandline import Run, files, printed_files, run, run_words, succeeds
 from safetensors import safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 from test_imagenet import canonical_arrays, torchvision_arrays, write
 
 from travjax import cli
@@ -60,6 +60,31 @@ def test_converted_weights_can_be_converted_again_in_place(converted, tmp_path):
     succeeds(tmp_path, "weights", "--from", path)
     assert path.read_bytes() == before
     assert files(tmp_path) == {path}
+
+
+def test_weights_made_from_caffe_are_converted_once_that_is_said(tmp_path, source):
+    arrays = load_file(source)
+    arrays["conv1.weight"] = np.ascontiguousarray(arrays["conv1.weight"][:, ::-1] / np.float32(58))
+    theirs = write(tmp_path / "caffe.safetensors", arrays)
+    out = tmp_path / "out"
+    refused = run(out, "weights", "--from", theirs)
+    assert (refused.code, refused.out, len(refused.err.splitlines())) == (2, "", 1)
+    told = re.search("travjax weights --from FILE (--input caffe --stride-in 1x1) ", refused.err)
+    done = succeeds(out, "weights", "--from", theirs, *told[1].split())
+    assert re.search("^made for +B, G, R, x - mean, from 0 to 255$", done.out, re.MULTILINE)
+    assert re.search(r"^strides +in the 1x1 convolutions \(v1\)$", done.out, re.MULTILINE)
+    found, wanted = (load_weights(path).arrays["conv1/kernel"] for path in (out / "resnet50.safetensors", source))
+    ratios = np.median(found / wanted, axis=(0, 1, 3))
+    np.testing.assert_allclose(ratios, np.array([58.395, 57.12, 57.375]) / 58, rtol=1e-5)
+
+
+def test_one_of_several_networks_is_chosen(tmp_path, source):
+    arrays = load_file(source)
+    both = {f"{name}{key}": array for name in ("model.", "model_ema.") for key, array in arrays.items()}
+    theirs = write(tmp_path / "both.safetensors", both)
+    assert "--prefix must say which" in run(tmp_path / "out", "weights", "--from", theirs).err
+    done = succeeds(tmp_path / "out", "weights", "--from", theirs, "--prefix", "model_ema.")
+    assert re.search(r"^left out +model\.bn1\.bias \[64\], .* and 261 more; only the trunk", done.out, re.MULTILINE)
 
 
 # ---- The hub
@@ -131,6 +156,7 @@ BAD_WORDS = {
     "unknown kind": (["--from", "BAD/notes.txt"], "BAD/notes.txt: unknown kind of file; allowed: .npz, .h5"),
     "damaged": (["--from", "BAD/text.npz"], "BAD/text.npz: cannot be read as .npz"),
     "no ResNet": (["--from", "BAD/other.safetensors"], "BAD/other.safetensors: no array of a ResNet"),
+    "an unknown input": (["--from", "BAD/narrow.safetensors", "--input", "bgr"], "--input: invalid choice: 'bgr'"),
     "narrow ResNet": (["--from", "BAD/narrow.safetensors"], "BAD/narrow.safetensors: .*; and [0-9]+ more"),
 }
 
@@ -169,7 +195,13 @@ def test_help_names_the_options_and_where_the_hub_looks(capsys):
         cli.main(["weights", "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
-    assert all(option in shown for option in ("--from FILE", "--hub [REPOSITORY]", "--file NAME", "--out DIR", *HUB))
+    assert all(
+        option in shown
+        for option in (
+            *("--from FILE", "--hub [REPOSITORY]", "--file NAME", "--out DIR", *HUB),
+            *("--input I", "--stride-in {1x1,3x3}", "--prefix P"),
+        )
+    )
 
 
 def test_parsers_of_all_commands_import_nothing_slow():

@@ -3,11 +3,14 @@
 The names in the files are written here by the oracles, never by the module under test.
 """
 
+import io
 import json
 import os
 import pickle
+import re
 import sys
 import warnings
+import zipfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -23,6 +26,7 @@ from safetensors.numpy import load_file, save_file
 
 from travjax.config import InputError
 from travjax.imagenet import Weights, apply_weights, describe, fetch, load_weights, save_safetensors
+from travjax.preprocessing import INPUTS
 from travjax.resnet import ResNet, ResNetConfig
 
 NARROW = ResNetConfig(width=4)
@@ -32,6 +36,9 @@ SHARED = Path(os.environ.get("TRAVJAX_DATA", Path(__file__).parents[1] / "../sha
 MEAN, STD = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 BLOCKS = {2: "abc", 3: "abcd", 4: "abcdef", 5: "abc"}
 SUFFIXES = [".npz", ".h5", ".safetensors", ".pth"]
+
+PIXELS = 64.0
+"""A first kernel of Keras is so many times smaller, as it is for pixels up to 255."""
 
 
 def canonical_arrays(width: int = 4, top: bool = True, seed: int = 0) -> dict[str, np.ndarray]:
@@ -101,7 +108,8 @@ def write(path: Path, arrays: dict[str, np.ndarray]) -> Path:
 
 
 def keras_arrays(arrays: dict[str, np.ndarray], caffe: bool = False) -> dict[str, np.ndarray]:
-    """Canonical arrays in the names of Keras, with biases of zero, as "layer/array"."""
+    """Canonical arrays in the names of Keras, with biases of zero, as "layer/array"; conv1 is for larger pixels."""
+    arrays = arrays | {"conv1/kernel": arrays["conv1/kernel"] / np.float32(PIXELS)}
     kinds = {"gamma": "gamma", "beta": "beta", "mean": "moving_mean", "var": "moving_variance"}
     named = {}
     for name, array in arrays.items():
@@ -200,7 +208,7 @@ def keras_stages(keras_model) -> dict[str, np.ndarray]:
 
 @pytest.fixture(scope="module")
 def keras_weights(keras_model, tmp_path_factory) -> dict[str, Weights]:
-    """What is read back from each kind of file that Keras 2 and 3 write."""
+    """What is read back from each kind of file that Keras 2 and 3 write, and from .keras of its first versions."""
     import keras
     from keras.src.legacy.saving import legacy_h5_format
 
@@ -213,12 +221,28 @@ def keras_weights(keras_model, tmp_path_factory) -> dict[str, Weights]:
             warnings.simplefilter("ignore", DeprecationWarning)  # Keras converts its arrays as NumPy 1 did
             model.save_weights(numbered)
             legacy_h5_format.save_weights_to_hdf5_group(file, model)
+            model.save(folder / "whole.keras")
         weights[f"Keras 3, {top}"] = load_weights(numbered)
         weights[f"Keras 2, {top}"] = load_weights(grouped)
+        weights[f".keras, {top}"] = load_weights(folder / "whole.keras")
+        weights[f"unnamed .keras, {top}"] = load_weights(without_names(folder / "whole.keras"))
     return weights
 
 
-LAYOUTS = [f"Keras {version}, {top} top" for version in (2, 3) for top in ("with", "without")]
+def without_names(path: Path) -> Path:
+    """The file as the first versions of Keras 3 wrote it, without the layers' names beside the arrays."""
+    with zipfile.ZipFile(path) as archive:
+        config, content = archive.read("config.json"), io.BytesIO(archive.read("model.weights.h5"))
+    with h5py.File(content, "r+") as file:
+        file.visititems(lambda place, item: item.attrs.pop("name", None) and None)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("config.json", config)
+        archive.writestr("model.weights.h5", content.getvalue())
+    return path
+
+
+KINDS_OF_KERAS = ("Keras 2", "Keras 3", ".keras", "unnamed .keras")
+LAYOUTS = [f"{kind}, {top} top" for kind in KINDS_OF_KERAS for top in ("with", "without")]
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -230,6 +254,23 @@ def test_every_layout_of_keras_gives_the_same_weights(keras_weights, layout):
     for name, array in weights.arrays.items():
         assert array.dtype == np.float32
         np.testing.assert_array_equal(array, first.arrays[name])
+
+
+def test_a_trunk_in_another_model_of_keras_is_found(tmp_path):
+    """With a head and an optimizer that has been used, as it is after fine-tuning."""
+    keras = pytest.importorskip("keras")
+    model = keras.Sequential([keras.Input((32, 32, 3)), keras.applications.ResNet50(weights=None, include_top=False)])
+    model.add(keras.layers.GlobalAveragePooling2D())
+    model.add(keras.layers.Dense(5))
+    model.compile("sgd", "mse")
+    model.optimizer.build(model.trainable_variables)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # as above
+        model.save(tmp_path / "tuned.keras")
+    weights = load_weights(tmp_path / "tuned.keras")
+    assert weights.left_out == ("dense/bias [5]", "dense/kernel [2048, 5]") and weights.classifier is None
+    kernel = model.layers[0].get_layer("conv4_block2_2_conv").kernel
+    np.testing.assert_array_equal(weights.arrays["res4b_branch2b/kernel"], kernel)
 
 
 def test_every_stage_of_a_converted_network_is_that_of_keras(keras_weights, keras_stages):
@@ -287,7 +328,7 @@ def torch_stages(arrays: dict[str, np.ndarray], images: np.ndarray, v1_5: bool) 
         return functional.batch_norm(x, *(state[f"{norm}.{kind}"] for kind in kinds), eps=1e-5)
 
     pixels_last = lambda x: x.permute(0, 2, 3, 1).numpy()
-    x = torch.tensor(images, dtype=torch.float64).permute(0, 3, 1, 2)
+    x = torch.tensor(np.array(images), dtype=torch.float64).permute(0, 3, 1, 2)
     x = functional.max_pool2d(convolution(x, "conv1", "bn1", 2, 3).relu(), 3, 2, 1)
     stages = {"stem": pixels_last(x)}
     for layer, letters in enumerate(BLOCKS.values(), start=1):
@@ -326,7 +367,7 @@ def test_every_stage_of_a_v1_network_is_that_of_torch(tmp_path, suffix):
     wanted = torch_stages(torchvision_arrays(arrays), normalised(), v1_5=False)
     images = normalised()
     if suffix == ".h5":  # whose kernels take B, G, R of 0 to 255
-        images = images[..., ::-1] / (255 * STD)
+        images = images[..., ::-1] * PIXELS / (255 * STD)
     features, stages = run(weights, images.astype(np.float32), width=4)
     for name, stage in stages.items():
         assert_close(stage, wanted[name])
@@ -347,6 +388,259 @@ def test_other_precisions_are_read_exactly(tmp_path, dtype):
     for weights in (pth, safe):
         assert {array.dtype for array in weights.arrays.values()} == {np.dtype(np.float32)}
         np.testing.assert_array_equal(weights.arrays["res4f_branch2b/kernel"], wanted)
+
+
+# Other places, names and heads in a file
+
+
+def nested(names: dict[str, np.ndarray], *prefixes: str) -> dict[str, np.ndarray]:
+    """The arrays after prefixes."""
+    return {"".join(prefixes) + name: array for name, array in names.items()}
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".safetensors", ".pth"])
+@pytest.mark.parametrize("prefix", ["module.", "state_dict.", "model.", "state_dict.module.backbone.", "params/"])
+def test_a_prefix_of_all_names_is_passed_over(tmp_path, suffix, prefix):
+    arrays = nested(arrays_in_file(suffix), prefix)
+    weights = load_weights(write(tmp_path / f"a{suffix}", arrays), NARROW)
+    wanted = load_weights(write(tmp_path / f"b{suffix}", arrays_in_file(suffix)), NARROW)
+    assert weights.arrays.keys() == wanted.arrays.keys() and weights.left_out == ()
+    for name, array in weights.arrays.items():
+        np.testing.assert_array_equal(array, wanted.arrays[name])
+
+
+@pytest.mark.parametrize("suffix", [".pth", ".pt", ".bin", ".ckpt", ".pth.tar"])
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_checkpoint_of_a_training_run_is_read(tmp_path, suffix, zipped):
+    torch = pytest.importorskip("torch")
+    state = {f"module.{name}": torch.tensor(array) for name, array in arrays_in_file(".pth").items()}
+    moments = {0: {"exp_avg": torch.zeros(3), "step": torch.tensor(7.0)}}
+    run = {"epoch": 3, "state_dict": state, "optimizer": {"state": moments, "param_groups": [{"lr": 0.1}]}}
+    path = tmp_path / f"checkpoint{suffix}"
+    torch.save(run | {"loss": torch.zeros(2)}, path, _use_new_zipfile_serialization=zipped)
+    weights = load_weights(path, NARROW)
+    np.testing.assert_array_equal(weights.arrays["conv1/kernel"], canonical_arrays()["conv1/kernel"])
+    assert weights.left_out == ("loss [2]",)
+    assert re.search(r"left out +loss \[2\]; only the trunk is needed", describe(weights))
+
+
+def hugging_face_arrays(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same in the names of transformers' ResNetForImageClassification."""
+    named = {}
+    for name, array in torchvision_arrays(arrays).items():
+        parts = name.split(".")
+        kind = "convolution" if "conv" in parts[-2] or parts[-2:-1] == ["0"] else "normalization"
+        if parts[0] == "fc":
+            named[f"classifier.1.{parts[1]}"] = array
+        elif not parts[0].startswith("layer"):
+            named[f"resnet.embedder.embedder.{kind}.{parts[-1]}"] = array
+        else:
+            inner = "shortcut" if parts[2] == "downsample" else f"layer.{int(parts[2][-1]) - 1}"
+            place = f"resnet.encoder.stages.{int(parts[0][5:]) - 1}.layers.{parts[1]}"
+            named[f"{place}.{inner}.{kind}.{parts[-1]}"] = array
+    return named
+
+
+def test_names_of_hugging_face(tmp_path):
+    """As the modules of modeling_resnet.py in transformers are nested; four names written out."""
+    named = hugging_face_arrays(canonical_arrays())
+    assert {
+        "resnet.embedder.embedder.convolution.weight",
+        "resnet.encoder.stages.0.layers.0.shortcut.normalization.running_var",
+        "resnet.encoder.stages.3.layers.2.layer.1.convolution.weight",
+        "classifier.1.bias",
+    } < named.keys() and len(named) == 53 * 6 + 2
+    weights = load_weights(write(tmp_path / "model.safetensors", named), NARROW)
+    assert (weights.naming, weights.stride_in, weights.epsilon) == ("Hugging Face", "3x3", 1e-5)
+    for name, array in canonical_arrays().items():
+        np.testing.assert_array_equal(weights.arrays[name], array)
+    bare = {name.removeprefix("resnet."): array for name, array in named.items() if name.startswith("resnet.")}
+    without = load_weights(write(tmp_path / "bare.safetensors", nested(bare, "model.backbone.")), NARROW)
+    assert (without.naming, without.classifier) == ("Hugging Face", None)
+    np.testing.assert_array_equal(without.arrays["res4f_branch2b/kernel"], weights.arrays["res4f_branch2b/kernel"])
+
+
+FEATURES = 128
+"""Of NARROW."""
+
+HEADS = {
+    "of 10 classes": {"fc.weight": (10, FEATURES), "fc.bias": (10,)},
+    "of two layers": {"fc.0.weight": (64, FEATURES), "fc.0.bias": (64,), "fc.2.weight": (5, 64), "fc.2.bias": (5,)},
+    "of another name": {"last_linear.weight": (1000, FEATURES), "last_linear.bias": (1000,)},
+    "with a norm": {"head.1.weight": (9, FEATURES), "head.0.weight": (FEATURES,), "head.0.running_var": (FEATURES,)},
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_another_head_is_left_out_and_said(tmp_path, head):
+    arrays = arrays_in_file(".safetensors", top=False)
+    arrays |= {name: np.ones(shape, np.float32) for name, shape in HEADS[head].items()}
+    weights = load_weights(write(tmp_path / "a.safetensors", arrays), NARROW)
+    assert weights.classifier is None and len(weights.arrays) == 53 * 5
+    assert weights.left_out == tuple(f"{name} {list(shape)}" for name, shape in sorted(HEADS[head].items()))
+    assert all(name in describe(weights) for name in weights.left_out)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"layer3.6.conv1.weight": (16, 64, 1, 1)},  # of a ResNet101
+        {"layer1.0.se.fc1.weight": (4, 16, 1, 1)},  # squeeze and excitation
+        {"layer2.0.aa.weight": (4,)},
+    ],
+    ids=str,
+)
+def test_parts_of_another_network_are_no_head(tmp_path, part):
+    arrays = arrays_in_file(".safetensors") | {name: np.ones(shape, np.float32) for name, shape in part.items()}
+    assert f"{next(iter(part))} is unexpected" in refusal(write(tmp_path / "a.safetensors", arrays))
+
+
+def test_of_several_networks_one_has_to_be_named(tmp_path):
+    one, other = arrays_in_file(".pth"), arrays_in_file(".pth", seed=1)
+    path = write(tmp_path / "a.pth", nested(one, "module.encoder_q.") | nested(other, "module.encoder_k."))
+    assert refusal(path) == (
+        "holds 2 networks, whose names begin with 'module.encoder_q.', 'module.encoder_k.': --prefix must say which"
+    )
+    for prefix, seed in (("module.encoder_q.", 0), ("module.encoder_k", 1)):
+        found = load_weights(path, NARROW, prefix=prefix)
+        np.testing.assert_array_equal(found.arrays["conv1/kernel"], canonical_arrays(seed=seed)["conv1/kernel"])
+    with pytest.raises(InputError, match="no array of a ResNet among its 534 that begin with 'ema.'"):
+        load_weights(path, NARROW, prefix="ema.")
+
+
+def test_arrays_of_the_other_byte_order_and_of_bfloat16(tmp_path):
+    arrays = canonical_arrays()
+    large = load_weights(
+        write(tmp_path / "a.npz", {n: a.astype(a.dtype.newbyteorder(">")) for n, a in arrays.items()}), NARROW
+    )
+    short = load_weights(write(tmp_path / "b.npz", {n: a.astype(jnp.bfloat16) for n, a in arrays.items()}), NARROW)
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        for name, array in keras_arrays(arrays).items():
+            file.create_dataset(f"{name.split('/')[0]}/{name}:0", data=array, dtype=">f8")
+    double = load_weights(tmp_path / "c.h5", NARROW)
+    for name in arrays.keys() - {"conv1/kernel"}:
+        np.testing.assert_array_equal(large.arrays[name], arrays[name])
+        np.testing.assert_array_equal(double.arrays[name], arrays[name])
+        np.testing.assert_array_equal(short.arrays[name], arrays[name].astype(jnp.bfloat16).astype(np.float32))
+
+
+# What pixels they are made for
+
+
+def pixels_of(name: str, images: np.ndarray) -> np.ndarray:
+    """What (x / 255 - mean) / std is in the units and the order of the colours of another network."""
+    x = images * STD + MEAN
+    bgr = lambda pixels: pixels[..., ::-1]
+    return {
+        "torch": images,
+        "torch-bgr": bgr(images),
+        "caffe": bgr(255 * (x - MEAN)),
+        "caffe-rgb": 255 * (x - MEAN),
+        "tf": 2 * x - 1,
+        "unit": x,
+    }[name]
+
+
+@pytest.mark.parametrize("name", INPUTS)
+def test_weights_for_any_input_are_converted(tmp_path, name):
+    """Away from the border, where the padding stands for another colour."""
+    arrays = torchvision_arrays(canonical_arrays())
+    arrays["conv1.weight"] = arrays["conv1.weight"] / np.abs(pixels_of(name, normalised())).std().astype(np.float32)
+    path = write(tmp_path / "a.safetensors", arrays)
+    weights = load_weights(path, NARROW, input=name, stride_in="1x1")
+    assert (weights.input, weights.stride_in) == (name, "1x1")
+    assert weights.origin == "a.safetensors, torchvision names" + (f", input {name}" if name != "torch" else "")
+    wanted = torch_stages(arrays, pixels_of(name, normalised()), v1_5=False)
+    features, stages = run(weights, normalised(), width=4)
+    inside = np.s_[:, 2:-2, 2:-2]
+    assert_close(stages["stem"][inside], wanted["stem"][inside])
+    if name not in ("tf", "unit"):
+        assert_close(features, wanted["features"])
+    save_safetensors(weights, tmp_path / "b.safetensors")
+    again = load_weights(tmp_path / "b.safetensors", NARROW)
+    np.testing.assert_array_equal(again.arrays["conv1/kernel"], weights.arrays["conv1/kernel"])
+
+
+def caffe_arrays(folded: bool) -> dict[str, np.ndarray]:
+    """Weights for B, G, R from 0 to 255 in torchvision's names, with statistics, or folded into gamma and beta."""
+    arrays = torchvision_arrays(canonical_arrays())
+    arrays["conv1.weight"] = arrays["conv1.weight"][:, ::-1] / np.float32(58.4)
+    for name in [name for name in arrays if folded and name.endswith("running_var")]:
+        arrays[name], arrays[name.replace("var", "mean")] = np.ones_like(arrays[name]), np.zeros_like(arrays[name])
+    return {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+
+
+@pytest.mark.parametrize("prefix", ["", "state_dict.backbone."])
+@pytest.mark.parametrize("folded", [True, False])
+def test_weights_made_from_caffe_are_refused_unless_they_are_said_to_be(tmp_path, folded, prefix):
+    path = write(tmp_path / "a.safetensors", nested(caffe_arrays(folded), prefix))
+    message = refusal(path)
+    if folded:
+        assert message.startswith(f"{prefix}bn1.running_mean = 0 and {prefix}bn1.running_var = 1, as in all 53 norms: ")
+    else:
+        assert message.startswith(f"{prefix}bn1.running_var = ") and f"squares of {prefix}conv1.weight" in message
+    assert "travjax weights --from FILE --input caffe --stride-in 1x1" in message
+    with pytest.raises(InputError, match="stride_in = None: must be 1x1, as in most of Caffe's, or 3x3: --stride-in"):
+        load_weights(path, NARROW, input="caffe")
+    weights = load_weights(path, NARROW, input="caffe", stride_in="1x1")
+    wanted = torch_stages(caffe_arrays(folded), pixels_of("caffe", normalised()), v1_5=False)
+    assert_close(run(weights, normalised(), width=4)[0], wanted["features"])
+    assert load_weights(path, NARROW, input="torch").arrays["conv1/kernel"].std() < 0.01  # who says so is believed
+
+
+def test_weights_of_keras_for_small_pixels_are_refused(tmp_path):
+    arrays = keras_arrays(canonical_arrays())
+    arrays["conv1_conv/kernel"] *= PIXELS
+    path = write(tmp_path / "a.h5", arrays)
+    message = refusal(path)
+    assert message.startswith("conv1_bn/moving_variance = ") and "made for smaller values; " in message
+    assert "--input torch takes them as what they are (or tf or unit)" in message
+    wanted = canonical_arrays()["conv1/kernel"]
+    np.testing.assert_array_equal(load_weights(path, NARROW, input="torch").arrays["conv1/kernel"], wanted)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5", ".safetensors"])
+def test_weights_of_a_network_before_training_are_read(tmp_path, suffix):
+    arrays = canonical_arrays()
+    fresh = {"gamma": 1, "beta": 0, "mean": 0, "var": 1}
+    for name in [name for name in arrays if not name.startswith("fc1000") and name.split("/")[1] in fresh]:
+        arrays[name] = np.full_like(arrays[name], fresh[name.split("/")[1]])
+    arrays["res3b_branch2c/gamma"][:] = 0  # as some begin
+    named = {".npz": lambda a: a, ".h5": keras_arrays, ".safetensors": torchvision_arrays}[suffix](arrays)
+    weights = load_weights(write(tmp_path / f"a{suffix}", named), NARROW)
+    np.testing.assert_array_equal(weights.arrays["res4f_branch2b/kernel"], arrays["res4f_branch2b/kernel"])
+
+
+def test_what_a_converted_file_is_made_for_is_not_said_again(tmp_path):
+    weights = load_weights(
+        write(tmp_path / "a.safetensors", caffe_arrays(True)), NARROW, input="caffe", stride_in="1x1"
+    )
+    save_safetensors(weights, tmp_path / "b.safetensors")
+    again = load_weights(tmp_path / "b.safetensors", NARROW)  # whose statistics are 0 and 1 still
+    assert (again.stride_in, again.origin) == ("1x1", "a.safetensors, torchvision names, input caffe")
+    for told in ({"input": "caffe"}, {"stride_in": "3x3"}):
+        with pytest.raises(InputError, match=f"{next(iter(told))} = '.*': must be "):
+            load_weights(tmp_path / "b.safetensors", NARROW, **told)
+
+
+@pytest.mark.parametrize(
+    ("told", "wrong"),
+    [({"input": "bgr"}, "input = 'bgr': must be one of torch"), ({"stride_in": "2x2"}, "stride_in = '2x2': must be")],
+)
+def test_what_weights_cannot_be_made_for_is_refused(tmp_path, told, wrong):
+    path = write(tmp_path / "a.safetensors", torchvision_arrays(canonical_arrays()))
+    with pytest.raises(InputError, match=wrong):
+        load_weights(path, NARROW, **told)
+
+
+def test_converted_weights_that_were_damaged_are_refused(tmp_path):
+    weights = load_weights(write(tmp_path / "a.npz", canonical_arrays()), NARROW)
+    path = tmp_path / "b.safetensors"
+    save_safetensors(weights, path)
+    damaged = bytearray(path.read_bytes())
+    damaged[-1000] ^= 1
+    path.write_bytes(damaged)
+    assert re.search(r" = [0-9a-f]{8}\.\.\. \(SHA-256\): must be [0-9a-f]{8}\.\.\.: the file is damaged", refusal(path))
 
 
 # Our .npz
@@ -584,7 +878,7 @@ def test_pickled_code_is_not_run(tmp_path, how):
     else:
         path.write_bytes(pickle.dumps(state, protocol=int(how[-1])))
     message = refusal(path)
-    assert message.startswith("cannot be read as .npz" if how == "npz" else "holds pickled code, which is not run")
+    assert "conv1/kernel is object, not" in message if how == "npz" else message.startswith("holds pickled code, which")
     assert not mark.exists()
     pickle.loads(pickle.dumps(Malicious(mark)))
     assert mark.exists()  # it would have
@@ -622,7 +916,9 @@ def test_paths_that_are_no_file_of_weights(tmp_path):
     (tmp_path / "a.npz").mkdir()
     assert refusal(tmp_path / "a.npz") == "is a folder; allowed: a file"
     assert refusal(tmp_path / "b.npz") == "no such file"
-    assert refusal(tmp_path / "b.onnx") == "unknown kind of file; allowed: .npz, .h5, .safetensors, .pth"
+    assert refusal(tmp_path / "b.onnx") == (
+        "unknown kind of file; allowed: .npz, .h5, .hdf5, .keras, .safetensors, .pth, .pt, .bin, .ckpt, .tar"
+    )
 
 
 @pytest.mark.parametrize(("suffix", "library"), [(".h5", "h5py"), (".pth", "torch")])

@@ -1,6 +1,8 @@
 """A trained estimator as one file: it comes back bit for bit, and what is no such file is said in one line."""
 
 import json
+import random
+import struct
 
 import jax
 import numpy as np
@@ -12,9 +14,10 @@ from safetensors.numpy import load_file, save, save_file
 from training import host, require_equal, run_of
 
 from travjax.config import InputError
-from travjax.estimator import take_apart
+from travjax.estimator import put_together, take_apart
 from travjax.model_file import read_model, write_model
-from travjax.weight_files import write_safetensors
+from travjax.predictor import DEFAULT, WEIGHTS
+from travjax.weight_files import open_arrays, write_safetensors
 
 NOTES = {"dataset": "0123", "epoch": 2, "step": 10, "score": 0.25}
 
@@ -129,6 +132,12 @@ def changed(name: str, change):
     return of
 
 
+def described(file) -> dict:
+    """What the file says of itself, without its checksums: as older versions wrote it."""
+    notes = json.loads(metadata(file)["travjax"])
+    return {"travjax": json.dumps({name: notes[name] for name in ("run", "notes")})}
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
@@ -139,7 +148,7 @@ def changed(name: str, change):
     ],
 )
 def test_arrays_that_are_not_its_own_are_named(file, change, named):
-    said = refusal(rewritten(file, change))
+    said = refusal(rewritten(file, change, described(file)))
     assert named in said.split(": not the arrays of its estimator; ")[0] and said.endswith("allowed: an undamaged file")
 
 
@@ -147,3 +156,94 @@ def test_arrays_of_another_estimator_are_named(tmp_path):
     path = tmp_path / "odd.safetensors"
     write_safetensors(path, {"heads/bias": np.zeros(3, np.float32)}, {"run": RUN.to_json(), "notes": {}})
     assert refusal(path).startswith("heads/bias, ")
+
+
+# ---- Damage
+
+
+def test_no_bit_that_turned_over_gives_another_estimator(file):
+    """200 of them: a file is refused, or it is what it was but for the key of its checksums, which is said."""
+    whole, wanted = file.read_bytes(), host(take_apart(estimator())[1])
+    length = struct.unpack("<Q", whole[:8])[0] + 8
+    chosen, refused = random.Random(0), 0
+    for number in range(200):
+        damaged = bytearray(whole)
+        damaged[chosen.randrange(length if number % 2 else len(whole))] ^= 1 << chosen.randrange(8)
+        file.write_bytes(damaged)
+        try:
+            run, network, notes = read_model(file)
+        except InputError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        else:  # 1e-05 and 1E-05 are the same number
+            assert (run, notes) == (RUN, NOTES)
+            require_equal(host(take_apart(network)[1]), wanted)
+    assert refused >= 195
+
+
+def test_a_damaged_array_is_named(file):
+    content = bytearray(file.read_bytes())
+    name, told = sorted(load_header(content).items())[0]
+    content[8 + struct.unpack("<Q", content[:8])[0] + told["data_offsets"][0]] ^= 1
+    file.write_bytes(content)
+    assert refusal(file).startswith(f"{name} = ") and refusal(file).endswith("the file is damaged")
+
+
+def load_header(content: bytes) -> dict:
+    length = struct.unpack("<Q", content[:8])[0]
+    return {name: told for name, told in json.loads(content[8 : 8 + length]).items() if name != "__metadata__"}
+
+
+@pytest.mark.parametrize("setting", [("preset", "elevation_scale"), ("preset", "field", "epsilon"), ("robot", "track")])
+def test_an_altered_setting_is_refused(file, setting):
+    """Each of them would give other predictions."""
+    told = json.loads(metadata(file)["travjax"])
+    *places, last = setting
+    table = told["run"]
+    for place in places:
+        table = table[place]
+    table[last] *= 1.01
+    rewritten(file, described={"travjax": json.dumps(told)})
+    assert refusal(file).startswith("the description = ")
+
+
+def test_a_file_without_checksums_is_read_and_said_to_have_none(file, capsys):
+    read_model(file)
+    assert capsys.readouterr().out == ""
+    rewritten(file, described=described(file))
+    run, network, notes = read_model(file)
+    assert (run, notes) == (RUN, NOTES)
+    require_equal(host(take_apart(network)[1]), host(take_apart(estimator())[1]))
+    said = capsys.readouterr().out
+    assert said.startswith(f"{file}: has no checksums, ") and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_none_are_neither_read_nor_written(file, tmp_path, value):
+    def spoilt(array):
+        array = array.copy()
+        array[-1] = value
+        return array
+
+    graph, variables = take_apart(estimator())
+    broken = put_together(
+        graph, jax.tree.map(lambda leaf: spoilt(np.array(leaf)) if leaf.ndim == 1 else leaf, variables)
+    )
+    with pytest.raises(InputError, match=rf"new.safetensors: .* = {value}: must be finite throughout"):
+        write_model(tmp_path / "new.safetensors", RUN, broken, NOTES)
+    assert not (tmp_path / "new.safetensors").exists()
+    rewritten(file, changed("hazard/bias", spoilt), described(file))
+    assert refusal(file) == (
+        f"heads/heads/hazard/bias = {value}: must be finite throughout, as the weights of a network are"
+    )
+
+
+def test_what_was_not_written_by_travjax_is_refused(file):
+    told = json.loads(described(file)["travjax"]) | {"sha257": {}}
+    rewritten(file, described={"travjax": json.dumps(told)})
+    assert refusal(file).startswith("holds no estimator of travjax")
+
+
+def test_the_estimator_that_comes_with_the_package_has_checksums():
+    with open_arrays(WEIGHTS / f"{DEFAULT}.safetensors") as shipped:
+        assert shipped.checked

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import numpy as np
 import pytest
 from commandline import FEW
@@ -112,3 +113,24 @@ def test_the_hazard_field_begins_with_random_weights():
 def test_the_hazard_field_has_no_first_phase():
     with pytest.raises(InputError, match="head_epochs = 1: must be 0"):
         replace(PRESET, training=replace(PRESET.training, head_epochs=1))
+
+
+@pytest.mark.parametrize("total", [1, 7])
+def test_a_field_that_diverges_ends_in_one_line_and_its_numbers_are_never_saved(tmp_path, total):
+    made = begun(tmp_path)
+    step = made._step
+
+    def spoilt(*batch):
+        loss = step(*batch)
+        if made.position.total == total:  # an update may spoil the state with the loss still a number
+            made.state = made.state | {"heads": jax.tree.map(lambda leaf: leaf * np.inf, made.state["heads"])}
+        return loss
+
+    made._step = spoilt
+    with pytest.raises(InputError, match="that is no number|loss = nan") as raised:
+        made.train()
+    assert "training stopped; the last checkpoint is kept" in str(raised.value) and "\n" not in str(raised.value)
+    if total == 7:
+        for which in ("latest", "best"):
+            assert all(np.isfinite(array).all() for array in saved_state(tmp_path, which).values())
+        assert load_estimator(tmp_path, "latest")

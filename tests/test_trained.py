@@ -9,6 +9,7 @@ import pytest
 from commandline import FEW
 from training import GRID, HUSKY, PRESET, copy, host, loads, require_equal, run_of, saved_state
 
+from travjax.checkpoint import Checkpoints
 from travjax.config import InputError
 from travjax.estimator import create, take_apart
 from travjax.parallel import Devices
@@ -158,6 +159,20 @@ def test_the_checkpoint_of_another_network_is_one_line(trained, tmp_path):
     folder = copy(trained, tmp_path / "run")
     replace(run_of(), preset=replace(PRESET, heads=replace(PRESET.heads, hidden=8))).save(folder)
     assert "other arrays than the network and optimiser have: heads/" in refusal(load_estimator, folder, "heads")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_estimator_with_a_number_that_is_none_is_refused(tmp_path, value):
+    run_of().save(tmp_path)
+    variables = take_apart(create(PRESET.trunk, PRESET.heads))[1]
+    spoilt = jax.tree.map(lambda leaf: leaf.at[0].set(value) if leaf.ndim == 1 else leaf, variables)
+    meta = {"optimizer": 0, "position": {}, "dataset": ""}
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    checkpoints.save(1, variables, meta, best=True)
+    checkpoints.save(2, spoilt, meta)
+    assert load_estimator(tmp_path, "best")
+    message = refusal(load_estimator, tmp_path, "latest")
+    assert message.startswith(f"{tmp_path}, checkpoint latest: heads/") and f" = {value}: must be finite" in message
 
 
 def test_an_estimator_that_was_loaded_can_be_used(trained):

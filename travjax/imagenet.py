@@ -1,17 +1,15 @@
 """ImageNet weights for the trunk: read from several kinds of files, checked name by name and shape by shape, and set.
 
 Whatever file they come from (weight_files.py), arrays are float32 afterwards and have one set of names: for each
-convolution `res2a_branch2a/kernel`, `/gamma`, `/beta`, `/mean`, `/var`; for the top layer, if there is one,
-`fc1000/kernel` and `fc1000/bias`. Kernels are [rows, cols, in, out] and take channels in the order R, G, B with values
-(x / 255 - mean) / std, about -2 to 2, a range that the channels of SPEC section 6 share.
+convolution `res2a_branch2a/kernel`, `/gamma`, `/beta`, `/mean`, `/var`; for the top layer, if there is one of 1000
+classes, `fc1000/kernel` and `fc1000/bias`. Kernels are [rows, cols, in, out] and take channels in the order R, G, B
+with values (x / 255 - mean) / std, about -2 to 2, a range that the channels of SPEC section 6 share.
 
 The weights of Keras are made for B, G, R with values x - mean (its `preprocess_input` in mode "caffe"), hundreds of
 units wide. Their first kernel is reversed and multiplied by PIXEL_SCALE, so that it does to (x / 255 - mean) / std
-what it did to their own values; the means of Keras, 103.939, 116.779, 123.68, are the same to half a unit.
+what it did to their own values. Other files, of whatever names, may be made for that as well: preprocessing.py.
 """
 
-import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,13 +20,12 @@ from flax import nnx
 from tabulate import tabulate
 
 from travjax.config import InputError, require
+from travjax.namings import CLASSES, Recognised, recognised
+from travjax.namings import NAMINGS as _NAMINGS
+from travjax.preprocessing import INPUTS, converted, has_statistics, require_fit, require_statistics
 from travjax.resnet import ResNet, ResNetConfig
-from travjax.weight_files import read_arrays, write_safetensors
-
-CLASSES = 1000
-
-PIXEL_SCALE = 255 * np.array([0.229, 0.224, 0.225], np.float32)
-"""Pixel values from 0 to 255 for one unit of (x / 255 - mean) / std, in the order R, G, B."""
+from travjax.stored_arrays import Stored, WeightFile, shown
+from travjax.weight_files import open_arrays, write_safetensors
 
 HUB = ("timm/resnet50.tv_in1k", "model.safetensors")
 """Repository and file on the Hugging Face hub: the weights of torchvision."""
@@ -37,8 +34,6 @@ SHOWN = 6
 """Mismatches that an error names; the others are counted."""
 
 _CANONICAL = {"kernel": "kernel", "scale": "gamma", "bias": "beta", "mean": "mean", "var": "var"}
-_TORCHVISION = {"gamma": "weight", "beta": "bias", "mean": "running_mean", "var": "running_var"}
-_KERAS = {"gamma": "gamma", "beta": "beta", "mean": "moving_mean", "var": "moving_variance"}
 
 
 @dataclass(frozen=True)
@@ -51,6 +46,8 @@ class Weights:
     origin:    file and naming of which a file of save_safetensors was made, else of this file
     stride_in: where the network that they were made for has its strides: "1x1" (v1) or "3x3" (v1.5)
     epsilon:   that network's batch-norm epsilon
+    input:     what pixels that network took, one of preprocessing.INPUTS; the arrays here take those of "torch"
+    left_out:  arrays of the file that are none of the network's, such as a top layer of other classes, with shapes
     """
 
     arrays: dict[str, np.ndarray]
@@ -59,6 +56,8 @@ class Weights:
     origin: str
     stride_in: str
     epsilon: float
+    input: str = "torch"
+    left_out: tuple[str, ...] = ()
 
     @property
     def classifier(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -68,89 +67,54 @@ class Weights:
         return self.arrays["fc1000/kernel"], self.arrays["fc1000/bias"]
 
 
-@dataclass(frozen=True)
-class _Naming:
-    """How a kind of file names and stores the arrays.
-
-    name:      (layer, array), both canonical, to the name in the file
-    by_output: kernels are stored [out, in, rows, cols] and [out, in]
-    by_pixel:  the first kernel takes B, G, R from 0 to 255, and convolutions have a bias
-    """
-
-    title: str
-    name: Callable[[str, str], str]
-    stride_in: str = "1x1"
-    epsilon: float = 1e-5
-    by_output: bool = False
-    by_pixel: bool = False
-
-
-def _position(layer: str) -> tuple[int, int, int]:
-    """Stage from 2, block from 0, and 0 for the projection or 1 to 3 along the block: "res3b_branch2c" is (3, 1, 3)."""
-    stage, block, branch = re.fullmatch(r"res(\d)([a-z])_branch(1|2[abc])", layer).groups()  # type: ignore[union-attr]
-    return int(stage), ord(block) - ord("a"), {"1": 0, "2a": 1, "2b": 2, "2c": 3}[branch]
-
-
-def _torchvision_name(layer: str, array: str) -> str:
-    if layer == "fc1000":
-        return "fc.weight" if array == "kernel" else "fc.bias"
-    block, number = "", 1
-    if layer != "conv1":
-        stage, index, number = _position(layer)
-        block = f"layer{stage - 1}.{index}."
-    convolution, norm = (f"conv{number}", f"bn{number}") if number else ("downsample.0", "downsample.1")
-    return f"{block}{convolution}.weight" if array == "kernel" else f"{block}{norm}.{_TORCHVISION[array]}"
-
-
-def _keras_name(layer: str, array: str) -> str:
-    if layer == "fc1000":
-        return f"predictions/{array}"
-    if layer != "conv1":
-        stage, block, number = _position(layer)
-        layer = f"conv{stage}_block{block + 1}_{number}"
-    return f"{layer}_bn/{_KERAS[array]}" if array in _KERAS else f"{layer}_conv/{array}"
-
-
-def _caffe_name(layer: str, array: str) -> str:
-    if array not in _KERAS:
-        return f"{layer}/{array}"
-    return f"bn_conv1/{_KERAS[array]}" if layer == "conv1" else f"bn{layer.removeprefix('res')}/{_KERAS[array]}"
-
-
-_NAMINGS = (
-    _Naming("canonical", lambda layer, array: f"{layer}/{array}"),
-    _Naming("torchvision", _torchvision_name, stride_in="3x3", by_output=True),
-    _Naming("Keras", _keras_name, epsilon=1.001e-5, by_pixel=True),
-    # Of 2016 to 2018, when Keras left epsilon at its default, with which these weights are the most accurate if the
-    # pool is padded: github.com/keras-team/keras-applications/issues/8.
-    _Naming("Keras before 2.2", _caffe_name, epsilon=1e-3, by_pixel=True),
-)
-
-
-def load_weights(path: str | Path, config: ResNetConfig = ResNetConfig()) -> Weights:
+def load_weights(
+    path: str | Path,
+    config: ResNetConfig = ResNetConfig(),
+    *,
+    input: str | None = None,
+    stride_in: str | None = None,
+    prefix: str | None = None,
+) -> Weights:
     """Reads and checks the weights of a network of this size, with or without its top layer.
 
-    Raises InputError when the file is missing, damaged or of no known kind, needs pickled code to be run, or its arrays
-    do not fit: missing, unexpected, of a wrong shape, no floating-point numbers, not finite, a negative variance. All
-    of those are in one error.
+    input, stride_in: what names do not say: one of preprocessing.INPUTS, "1x1" or "3x3"; as the names are usual unless
+        given, and then checked as far as the numbers tell
+    prefix: what names begin with, where a file holds several networks
+    Raises InputError when the file is missing, damaged or of no known kind, needs pickled code to be run, its weights
+    show that they are made for another input, or its arrays do not fit: missing, unexpected, of a wrong shape, no
+    floating-point numbers, not finite, a negative variance. All of those are in one error.
     """
     path = Path(path)
     try:
-        found, notes = read_arrays(path)
-        naming, expected = _recognised(found, config)
-        _check(found, naming, expected, config)
-        stride_in, epsilon = notes.get("stride_in", naming.stride_in), notes.get("epsilon", naming.epsilon)
-        replace(config, stride_in=stride_in, epsilon=epsilon)  # raises InputError unless they are allowed
-        return Weights(
-            arrays=_converted(found, naming, expected),
-            path=str(path),
-            naming=naming.title,
-            origin=notes.get("origin", f"{path.name}, {naming.title} names"),
-            stride_in=stride_in,
-            epsilon=epsilon,
-        )
+        require(input is None or input in INPUTS, "input", input, f"one of {', '.join(INPUTS)}")
+        with open_arrays(path) as file:
+            network = recognised(file.arrays, _NAMINGS, _shapes(config), prefix)
+            arrays = _read(file.arrays, network, config)
+            left_out = tuple(f"{shown(name)} {list(file.arrays[name].shape)}" for name in network.left_out)
+        settings = _settings(file, network, input, stride_in, path)
+        replace(config, stride_in=settings["stride_in"], epsilon=settings["epsilon"])  # raises unless they are allowed
+        arrays = _canonical(arrays, network, settings["input"], told=input is not None or bool(file.notes))
+        return Weights(arrays, str(path), network.naming.title, left_out=left_out, **settings)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def _settings(file: WeightFile, network: Recognised, input: str | None, stride_in: str | None, path: Path) -> dict:
+    """Origin, strides, epsilon and input: what the file says, or what is given, or what is usual under its names."""
+    naming, notes = network.naming, file.notes
+    if notes:
+        require(input in (None, "torch"), "input", input, "left out: the file is one of travjax weights, for torch")
+        require(stride_in in (None, notes.get("stride_in")), "stride_in", stride_in, f"{notes.get('stride_in')!r} here")
+    elif (input or "").startswith("caffe") and naming.by_output:
+        allowed = "1x1, as in most of Caffe's, or 3x3: --stride-in, which names do not say"
+        require(stride_in is not None, "stride_in", stride_in, allowed)
+    given = "" if input in (None, naming.input) else f", input {input}"
+    return {
+        "origin": notes.get("origin", f"{path.name}, {naming.title} names{given}"),
+        "stride_in": notes.get("stride_in", stride_in or naming.stride_in),
+        "epsilon": notes.get("epsilon", naming.epsilon),
+        "input": input or naming.input,
+    }
 
 
 def _variables(resnet: ResNet) -> dict[str, nnx.Variable]:
@@ -171,50 +135,34 @@ def _shapes(config: ResNetConfig) -> dict[str, tuple[int, ...]]:
     return shapes | {"fc1000/kernel": (config.features, CLASSES), "fc1000/bias": (CLASSES,)}
 
 
-def _recognised(found: dict, config: ResNetConfig) -> tuple[_Naming, dict[str, tuple[str, tuple[int, ...]]]]:
-    """The naming that most arrays follow; and the canonical name and the shape of each array that should be there."""
+def _read(found: dict[str, Stored], network: Recognised, config: ResNetConfig) -> dict[str, np.ndarray]:
+    """The network's arrays, float32, by canonical name; raises InputError that names whatever does not fit.
 
-    def expected(naming: _Naming) -> dict[str, tuple[str, tuple[int, ...]]]:
-        shapes = dict(_shapes(config))
-        if naming.by_pixel:
-            shapes |= {name.replace("/beta", "/bias"): shape for name, shape in shapes.items() if "/beta" in name}
-        by_name = {naming.name(*name.split("/")): (name, shape) for name, shape in shapes.items()}
-        top = {name for name, (canonical, _) in by_name.items() if canonical.startswith("fc1000/")}
-        return by_name if top & set(found) else {name: by_name[name] for name in by_name if name not in top}
-
-    candidates = [(naming, expected(naming)) for naming in _NAMINGS]
-    naming, wanted = max(candidates, key=lambda candidate: len(candidate[1].keys() & found.keys()))
-    if not wanted.keys() & found.keys():
-        known = ", ".join(dict.fromkeys(naming.name("conv1", "kernel") for naming in _NAMINGS))
-        raise InputError(f"no array of a ResNet among its {len(found)}; allowed names are, for the first: {known}")
-    return naming, wanted
-
-
-def _check(found: dict[str, np.ndarray], naming: _Naming, expected: dict, config: ResNetConfig) -> None:
-    """Raises InputError that names whatever does not fit."""
-    wrong = [f"{name} is missing" for name in expected if name not in found]
-    wrong += [f"{name} is unexpected" for name in found if name not in expected]
-    for name in [name for name in expected if name in found]:
-        canonical, shape = expected[name]
-        array, shape = found[name], _stored(shape) if naming.by_output else shape
-        if not jnp.issubdtype(array.dtype, jnp.floating):
-            wrong.append(f"{name} is {array.dtype}, not floating-point")
-        elif array.shape != shape:
-            wrong.append(f"{name} is {list(array.shape)}, not {list(shape)}")
-        elif not np.isfinite(_float32(array)).all():
-            wrong.append(f"{name} is not finite throughout")
-        elif canonical.endswith("/var") and (array < 0).any():
-            wrong.append(f"{name} is negative somewhere")
+    Only what has the right shape is read, so nothing takes more memory than the network.
+    """
+    wrong = [f"{shown(name)} is missing" for name in network.expected if name not in found]
+    wrong += [f"{shown(name)} is unexpected" for name in network.unexpected]
+    arrays = {}
+    for name, (canonical, shape) in network.expected.items():
+        if name not in found:
+            continue
+        stored = found[name]
+        if not stored.floating:
+            wrong.append(f"{shown(name)} is {shown(stored.dtype)}, not floating-point")
+        elif stored.shape != shape:
+            wrong.append(f"{shown(name)} is {list(stored.shape)}, not {list(shape)}")
+        else:
+            array = arrays[canonical] = _float32(stored.read())
+            if not np.isfinite(array).all():
+                wrong.append(f"{shown(name)} is not finite throughout")
+            elif canonical.endswith("/var") and (array < 0).any():
+                wrong.append(f"{shown(name)} is negative somewhere")
     if wrong:
         more = f"; and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
         count = f"{len(wrong)} array{'s' if len(wrong) > 1 else ''}"
         size = f"a trunk of blocks {list(config.blocks)}, width {config.width}"
-        raise InputError(f"{count} of {naming.title} naming wrong for {size}: {'; '.join(wrong[:SHOWN])}{more}")
-
-
-def _stored(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """[rows, cols, in, out] -> [out, in, rows, cols], [in, out] -> [out, in]."""
-    return (*shape[:-3:-1], *shape[:-2])
+        raise InputError(f"{count} of {network.naming.title} naming wrong for {size}: {'; '.join(wrong[:SHOWN])}{more}")
+    return arrays
 
 
 def _float32(array: np.ndarray) -> np.ndarray:
@@ -222,17 +170,25 @@ def _float32(array: np.ndarray) -> np.ndarray:
         return array.astype(np.float32)
 
 
-def _converted(found: dict[str, np.ndarray], naming: _Naming, expected: dict) -> dict[str, np.ndarray]:
-    """Canonical arrays; a convolution's bias is taken off the mean that is subtracted from its output."""
-    arrays = {canonical: _float32(found[name]) for name, (canonical, _) in expected.items()}
-    if naming.by_output:
-        for name, array in arrays.items():
-            if array.ndim > 1:
-                arrays[name] = np.ascontiguousarray(np.moveaxis(array, (0, 1), (-1, -2)))
-    if naming.by_pixel:
+def _canonical(arrays: dict[str, np.ndarray], network: Recognised, input: str, told: bool) -> dict[str, np.ndarray]:
+    """Arrays in the canonical layout, for the canonical input; a convolution's bias is taken off the mean that is
+    subtracted from its output.
+
+    told: the input is known, and not looked for in the numbers
+    """
+    names = {canonical: shown(name) for name, (canonical, _) in network.expected.items()}
+    if not told:
+        require_statistics(arrays, names)
+    measured = has_statistics(arrays)
+    if network.naming.by_output:
+        kernels = {name: array for name, array in arrays.items() if array.ndim > 1}
+        arrays |= {name: np.ascontiguousarray(np.moveaxis(array, (0, 1), (-1, -2))) for name, array in kernels.items()}
+    if network.naming.biased:
         for layer in [name.removesuffix("/mean") for name in arrays if name.endswith("/mean")]:
             arrays[f"{layer}/mean"] -= arrays.pop(f"{layer}/bias")
-        arrays["conv1/kernel"] = arrays["conv1/kernel"][:, :, ::-1] * PIXEL_SCALE[:, None]
+    arrays = converted(arrays, INPUTS[input])
+    if measured and not told:
+        require_fit(arrays, input, names)
     return arrays
 
 
@@ -292,8 +248,17 @@ def describe(weights: Weights) -> str:
         "numbers": f"{sum(array.size for array in weights.arrays.values()):,}",
         "zeros in kernels": f"{zero:.1%}",
         "top layer": f"{CLASSES} classes" if weights.classifier else "none",
+        "left out": _left_out(weights),
         "strides": f"in the {weights.stride_in} convolutions ({'v1' if weights.stride_in == '1x1' else 'v1.5'})",
         "batch-norm epsilon": f"{weights.epsilon:g}",
-        "input": "R, G, B, (x / 255 - mean) / std",
+        "made for": INPUTS[weights.input].text,
+        "input": INPUTS["torch"].text,
     }
     return tabulate(rows.items(), tablefmt="plain", disable_numparse=True)
+
+
+def _left_out(weights: Weights) -> str:
+    """The first arrays that are none of the network's; most are not read at all."""
+    names = weights.left_out
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return f"{', '.join(names[:SHOWN])}{more}; only the trunk is needed" if names else "nothing"

@@ -16,7 +16,7 @@ import travjax.field
 from travjax.actions import ActionSpace
 from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, from_json, require, to_json
-from travjax.estimator import Estimator, put_together, take_apart
+from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
 from travjax.field import HazardField
 from travjax.files import written_whole
 from travjax.grid import Grid
@@ -26,6 +26,7 @@ from travjax.map_data import MapSource
 from travjax.models import FIELD
 from travjax.preset import Preset
 from travjax.robot import Robot
+from travjax.weight_files import require_finite
 
 TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
 """What each phase trains, and training of the hazard field."""
@@ -146,11 +147,20 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
-    Raises InputError when there is none or it is damaged.
+    Raises InputError when there is none, it is damaged, or a number of it is not finite.
     """
     run = Run.load(folder)
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
     state, meta = checkpoints.restore(lambda meta: run.template(meta["optimizer"]), which)
     for notice in checkpoints.notices:
         print(notice)
+    variables = {name: state[name] for name in VARIABLES}
+    for name, leaf in named_leaves(variables).items():
+        require_finite(f"{folder}, checkpoint {which}: {name}", np.asarray(leaf))
     return run, put_together(run.graph(), state), meta
+
+
+def named_leaves(variables: Any) -> dict[str, Any]:
+    """The leaves of an estimator's variables by path, in their order: "trunk/trunk/stem/kernel"."""
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator="/").removesuffix("/value")
+    return {name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}

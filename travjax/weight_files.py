@@ -1,116 +1,189 @@
-"""Arrays by name out of files of weights: .npz, Keras .h5, safetensors, and .pth, of which no pickled code is run."""
+"""Arrays by name out of files of weights: .npz, safetensors, .pth, of which no pickled code is run, and Keras' files.
 
+Files that travjax writes are .safetensors with the SHA-256 of each array and of the notes in their header.
+"""
+
+import hashlib
 import json
 import pickle
-import re
-import warnings
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from travjax.config import InputError
 from travjax.files import written_whole
+from travjax.keras_files import open_hdf5, open_keras
+from travjax.stored_arrays import Stored, WeightFile, open_zip, reading, shown, stored_npy
 
-Arrays = dict[str, np.ndarray]
+SUMS = "sha256"
+"""Key of the checksums beside the notes."""
 
-KERAS_1 = {"W": "kernel", "b": "bias", "running_mean": "moving_mean", "running_std": "moving_variance"}
-"""Names of Keras 1 and those of Keras 2; both of the last hold variances."""
+NOTES = "__metadata__"
+"""Whose checksum is that of the notes; safetensors allows no array of that name."""
 
-KERAS_NORM = ("gamma", "beta", "moving_mean", "moving_variance")
-"""Arrays of a batch normalisation, in the order in which Keras 3 numbers them."""
+_LETTERS = {"F": "float", "I": "int", "U": "uint"}
+
+TYPES = {f"{letter}{bits}": f"{kind}{bits}" for letter, kind in _LETTERS.items() for bits in (8, 16, 32, 64)}
+TYPES |= {"BF16": "bfloat16", "BOOL": "bool"}
+"""Names of types in safetensors and elsewhere."""
 
 
-def read_arrays(path: Path) -> tuple[Arrays, dict]:
-    """The arrays by their names in the file, and the notes that write_safetensors added.
+@contextmanager
+def open_arrays(path: Path) -> Iterator[WeightFile]:
+    """A file of weights, whose arrays can be read as long as it is open.
 
-    Raises InputError, without the path, when the file is missing, of no known kind or damaged, or needs code to be run.
+    Raises InputError, without the path, when the file is missing, of no known kind or damaged, needs code to be run,
+    points to other files, or claims what its size does not bear out.
     """
-    readers = {".npz": _npz, ".h5": _keras, ".safetensors": _safetensors, ".pth": _torch}
     suffix = path.suffix.lower()
-    if suffix not in readers:
-        raise InputError(f"unknown kind of file; allowed: {', '.join(readers)}")
-    if not path.is_file():
-        raise InputError("is a folder; allowed: a file" if path.is_dir() else "no such file")
-    try:
-        return readers[suffix](path)
-    except InputError:
-        raise
-    except Exception as error:  # libraries raise all sorts over a damaged file
-        text = (getattr(error, "strerror", None) or str(error)).partition("\n")[0]
-        reason = text if " " in text else f"{type(error).__name__} {text}".strip()
-        raise InputError(f"cannot be read as {suffix}, damaged or something else: {reason}") from None
+    if suffix not in READERS:
+        raise InputError(f"unknown kind of file; allowed: {', '.join(READERS)}")
+    with reading(suffix):
+        exists, folder = path.is_file(), path.is_dir()
+    if not exists:
+        raise InputError("is a folder; allowed: a file" if folder else "no such file")
+    with ExitStack() as held:
+        file = READERS[suffix](path, held)
+        counters = [name for name in file.arrays if name.endswith("num_batches_tracked")]
+        for name in counters:
+            del file.arrays[name]
+        yield file
 
 
-def write_safetensors(path: Path, arrays: Arrays, notes: dict) -> None:
-    """Writes arrays and notes (numbers and texts), whole or not at all."""
+def write_safetensors(path: Path, arrays: dict[str, np.ndarray], notes: dict) -> None:
+    """Writes arrays, notes (numbers and texts) and the checksums of both, whole or not at all.
+
+    Raises InputError that names an array of which a number is not finite.
+    """
     from safetensors.numpy import save
 
+    for name, array in arrays.items():
+        require_finite(f"{path}: {name}", array)
+    sums = {NOTES: _sum_of_notes(notes)} | {name: _sum_of(array) for name, array in arrays.items()}
+    header = {"travjax": json.dumps(notes | {SUMS: sums})}  # one entry: safetensors writes several in any order
     with written_whole(path) as temporary:
-        temporary.write_bytes(save(arrays, metadata={"travjax": json.dumps(notes)}))  # save_file hides it from others
+        temporary.write_bytes(save(arrays, metadata=header))  # save_file hides it from others
 
 
-def _npz(path: Path) -> tuple[Arrays, dict]:
-    with path.open("rb") as file, np.lib.npyio.NpzFile(file, allow_pickle=False) as arrays:
-        return dict(arrays), {}
+def require_finite(what: str, array: np.ndarray) -> None:
+    """Raises InputError that names the first number of an array that is none."""
+    finite = np.isfinite(array)
+    if not finite.all():
+        value = float(array.flat[int(np.argmin(finite))])
+        raise InputError(f"{what} = {value}: must be finite throughout, as the weights of a network are")
 
 
-def _safetensors(path: Path) -> tuple[Arrays, dict]:
+def _npz(path: Path, held: ExitStack) -> WeightFile:
+    archive = held.enter_context(open_zip(path, ".npz"))
+    infos = [info for info in archive.infolist() if info.filename.endswith(".npy")]
+    return WeightFile({info.filename.removesuffix(".npy"): stored_npy(archive, info, ".npz") for info in infos}, {})
+
+
+def _safetensors(path: Path, held: ExitStack) -> WeightFile:
     from safetensors import safe_open
 
-    with safe_open(path, framework="np") as file:
+    with reading(".safetensors"):
+        file = held.enter_context(safe_open(path, framework="np"))
         notes = dict(json.loads((file.metadata() or {}).get("travjax", "{}")))
-        return {name: file.get_tensor(name) for name in file.keys() if not _is_counter(name)}, notes
+        places = {name: file.get_slice(name) for name in file.keys()}
+    sums = notes.pop(SUMS, None)
+    if sums is not None:
+        given = sums.get(NOTES) if isinstance(sums, dict) else None
+        _require_sum("the description", _sum_of_notes(notes), given)
+
+    def stored(name: str) -> Stored:
+        def read() -> np.ndarray:
+            with reading(".safetensors"):
+                array = file.get_tensor(name)
+            if sums is not None:
+                _require_sum(shown(name), _sum_of(array), sums.get(name))
+            return array
+
+        kind = places[name].get_dtype()
+        return Stored(tuple(places[name].get_shape()), TYPES.get(kind, kind), read)
+
+    return WeightFile({name: stored(name) for name in places}, notes, checked=sums is not None)
 
 
-def _torch(path: Path) -> tuple[Arrays, dict]:
-    """A state dict; only tensors and plain containers are unpickled."""
+def _require_sum(what: str, found: str, given: object) -> None:
+    if found != given:
+        raise InputError(f"{what} = {found[:8]}... (SHA-256): must be {shown(str(given))[:8]}...: the file is damaged")
+
+
+def _sum_of(array: np.ndarray) -> str:
+    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+
+
+def _sum_of_notes(notes: dict) -> str:
+    return hashlib.sha256(json.dumps(notes, sort_keys=True).encode()).hexdigest()
+
+
+def _torch(path: Path, held: ExitStack) -> WeightFile:
+    """A saved state dict, or a checkpoint that holds one; only tensors and plain containers are unpickled."""
     try:
         import torch
     except ImportError:
         raise InputError("reading it needs torch: pip install torch; .safetensors needs nothing") from None
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on unusual pickles, which are refused below
-            state = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError:
-        raise InputError("holds pickled code, which is not run, or is damaged; allowed: a saved state_dict()") from None
-    if not isinstance(state, dict) or not all(isinstance(value, torch.Tensor) for value in state.values()):
-        raise InputError("holds something else than tensors by name; allowed: a saved state_dict()")
-    plain = lambda tensor: (tensor.float() if tensor.is_floating_point() else tensor).numpy()
-    return {str(name): plain(tensor.detach()) for name, tensor in state.items() if not _is_counter(str(name))}, {}
+    with path.open("rb") as file:
+        zipped = file.read(4) == b"PK\3\4"
+    if zipped:
+        _check_torch_zip(path)
+    with reading(path.suffix):
+        try:
+            state = torch.load(path, map_location="cpu", weights_only=True, mmap=zipped)
+        except pickle.UnpicklingError:
+            raise InputError(
+                "holds pickled code, which is not run, or is damaged; allowed: a saved state_dict()"
+            ) from None
+    tensors = _tensors(state, torch.Tensor)
+    if not tensors:
+        raise InputError("holds no tensors by name; allowed: a saved state_dict()")
+    return WeightFile({name: _stored_tensor(tensor, path.suffix) for name, tensor in tensors.items()}, {})
 
 
-def _is_counter(name: str) -> bool:
-    """Of training steps, which torch's batch normalisation keeps."""
-    return name.endswith(".num_batches_tracked")
+def _check_torch_zip(path: Path) -> None:
+    """torch maps the file into memory without a look at its checksums."""
+    with open_zip(path, ".pth") as archive:
+        for info in archive.infolist():
+            if info.compress_type or info.file_size != info.compress_size:
+                raise InputError(f"{shown(info.filename)} is compressed: must be stored, as torch.save does it")
+        with reading(path.suffix):
+            damaged = archive.testzip()
+    if damaged:
+        raise InputError(f"{shown(damaged)} is not what its checksum says: the file is damaged")
 
 
-def _keras(path: Path) -> tuple[Arrays, dict]:
-    """Arrays as "layer/array", from .h5 of Keras 1 and 2 and .weights.h5 of Keras 3."""
-    try:
-        import h5py
-    except ImportError:
-        raise InputError("reading it needs h5py: pip install h5py") from None
-    arrays: Arrays = {}
+def _tensors(state: Any, kind: type) -> dict[str, Any]:
+    """Tensors of dicts in dicts, their keys joined by dots; a dict that is there twice counts once."""
+    found: dict[str, Any] = {}
+    waiting, seen = deque([("", state)]), {id(state)}
+    while waiting:
+        place, holder = waiting.popleft()
+        for key, value in holder.items() if isinstance(holder, dict) else ():
+            if not isinstance(key, str):
+                continue  # an optimizer's, which numbers its parameters
+            if isinstance(value, kind):
+                if place + key in found:
+                    raise InputError(f"holds {shown(place + key)} twice: must be one")
+                found[place + key] = value
+            elif isinstance(value, dict) and id(value) not in seen:
+                seen.add(id(value))
+                waiting.append((f"{place}{key}.", value))
+    return found
 
-    def add(place: str, item) -> None:
-        if isinstance(item, h5py.Dataset):
-            name = _keras_name(place.split("/"), item.parent.attrs.get("name"))
-            if name in arrays:
-                raise InputError(f"holds {name} twice; allowed: one network")
-            arrays[name] = np.asarray(item[()])
 
-    with h5py.File(path) as file:
-        file.visititems(add)
-    return arrays, {}
+def _stored_tensor(tensor: Any, kind: str) -> Stored:
+    def read() -> np.ndarray:
+        with reading(kind):
+            return (tensor.float() if tensor.is_floating_point() else tensor).detach().numpy()
+
+    return Stored(tuple(tensor.shape), str(tensor.dtype).removeprefix("torch."), read)
 
 
-def _keras_name(place: list[str], layer: str | None) -> str:
-    """The layer is given by Keras 3, whose groups are only numbered: layers/batch_normalization_7/vars/0."""
-    if layer is not None:
-        order = KERAS_NORM if place[-3].startswith("batch_normalization") else ("kernel", "bias")
-        return f"{layer}/{dict(enumerate(order)).get(int(place[-1]), place[-1])}"
-    # Keras 2: conv1_conv/conv1_conv/kernel:0; Keras 1: conv1/conv1_W_1:0
-    *_, layer, array = ["", *place]
-    array = re.sub(rf"^{re.escape(layer)}_|_\d+$", "", array.split(":")[0])
-    return f"{layer}/{KERAS_1.get(array, array)}"
+READERS = {".npz": _npz, ".h5": open_hdf5, ".hdf5": open_hdf5, ".keras": open_keras, ".safetensors": _safetensors}
+READERS |= dict.fromkeys((".pth", ".pt", ".bin", ".ckpt", ".tar"), _torch)
+"""What is read, by the ending of the name; .tar is torch's .pth.tar."""

@@ -1,0 +1,155 @@
+"""What pixels a ResNet's weights were made for, and how they are made to take (x / 255 - mean) / std in R, G, B.
+
+Names in a file do not say it. Two things can be told from its numbers: statistics of 0 and 1 throughout are none that
+were measured, and the variance that a convolution puts out is bounded by its kernel and by what it takes in, so a
+first kernel for pixels up to 255 is not taken for one for values about 1. From the first running means follows the
+mean of the input as well. The order of the colours and the place of the strides leave no mark.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from travjax.config import InputError
+
+MEAN = np.array([0.485, 0.456, 0.406])
+STD = np.array([0.229, 0.224, 0.225])
+
+PIXEL_SCALE = 255 * STD.astype(np.float32)
+"""Pixel values from 0 to 255 for one unit of (x / 255 - mean) / std, in the order R, G, B."""
+
+MOST = 49 * float(np.sum((0.5 / STD) ** 2))
+"""Bound on variance out over squares of a 7 x 7 kernel: no pixel from 0 to 1 has a variance above 1/4, and that of a
+weighted sum is at most the sum of the squared weights times that of the variances. 720; a quarter of the filters of
+resnet50_imagenet.npz have 4 and more."""
+
+LEAST = 0.02
+"""The same from below, where a quarter of the filters have more in any network: no bound, only filters for the finest
+texture come near it. For values about 1 taken for pixels up to 255, the 4 would be 0.001."""
+
+EXPLAINED = 0.9
+"""Share of the first running means that the mean of three colours explains, from which on it is believed (0.99 in
+resnet50_imagenet.npz, 0.05 for random numbers)."""
+
+FEWEST = 16
+"""Filters that this takes."""
+
+NEAR = 0.06
+"""Difference of means of colours, in units of (x / 255 - mean) / std; 0.04 in resnet50_imagenet.npz."""
+
+
+@dataclass(frozen=True)
+class PixelInput:
+    """Values of pixels, scale * y + offset where y is (x / 255 - mean) / std; both in the order R, G, B.
+
+    reverse: the first kernel takes B, G, R
+    """
+
+    text: str
+    scale: np.ndarray
+    offset: np.ndarray
+    reverse: bool = False
+
+
+_ONES, _NONE = np.ones(3, np.float32), np.zeros(3)
+
+INPUTS = {
+    "torch": PixelInput("R, G, B, (x / 255 - mean) / std", _ONES, _NONE),
+    "torch-bgr": PixelInput("B, G, R, (x / 255 - mean) / std", _ONES, _NONE, reverse=True),
+    # The means of Keras, 103.939, 116.779, 123.68, and of others are the same to half a unit or one.
+    "caffe": PixelInput("B, G, R, x - mean, from 0 to 255", PIXEL_SCALE, _NONE, reverse=True),
+    "caffe-rgb": PixelInput("R, G, B, x - mean, from 0 to 255", PIXEL_SCALE, _NONE),
+    "tf": PixelInput("R, G, B, x / 127.5 - 1", 2 * STD.astype(np.float32), 2 * MEAN - 1),
+    "unit": PixelInput("R, G, B, x / 255", STD.astype(np.float32), MEAN),
+}
+"""By the names of Keras' preprocess_input where it has them; mean and std are those of ImageNet."""
+
+CONVERT = "travjax weights --from FILE --input {} takes them as what they are"
+
+FROM_CAFFE = "caffe --stride-in 1x1"
+"""What most weights are that were made from Caffe's: MSRA's and Detectron's, and mmdet's *_caffe."""
+
+
+def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.ndarray]:
+    """Canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std; equal but at the border, where the
+    padding is of zeros whatever a zero stands for."""
+    kernel = arrays["conv1/kernel"][:, :, ::-1] if given.reverse else arrays["conv1/kernel"]
+    changed = {"conv1/kernel": kernel * given.scale[:, None]}
+    if given.offset.any():
+        added = kernel.sum(axis=(0, 1), dtype=np.float64).T @ given.offset
+        changed["conv1/mean"] = (arrays["conv1/mean"] - added).astype(np.float32)
+    return arrays | changed
+
+
+def has_statistics(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether any running mean is not 0 or any running variance not 1."""
+    every = {"mean": 0, "var": 1}
+    return any((array != every[kind]).any() for kind, array in _of_kinds(arrays, *every))
+
+
+def is_untrained(arrays: dict[str, np.ndarray]) -> bool:
+    """Whether gamma is 1 or, at the end of a block, 0 throughout and nothing is added: a network before training."""
+    allowed = {"gamma": (0, 1), "beta": (0,), "bias": (0,)}
+    return all(np.isin(array, allowed[kind]).all() for kind, array in _of_kinds(arrays, *allowed))
+
+
+def _of_kinds(arrays: dict[str, np.ndarray], *kinds: str):
+    split = ((name.split("/"), array) for name, array in arrays.items())
+    return [(kind, array) for (layer, kind), array in split if kind in kinds and layer != "fc1000"]
+
+
+def require_statistics(arrays: dict[str, np.ndarray], names: dict[str, str]) -> None:
+    """Raises InputError for trained weights, canonical but for their input, without statistics.
+
+    names: in the file, by canonical name
+    """
+    if not has_statistics(arrays) and not is_untrained(arrays):
+        count = sum(name.endswith("/var") for name in arrays)
+        raise InputError(
+            f"{names['conv1/mean']} = 0 and {names['conv1/var']} = 1, as in all {count} norms: must be statistics that "
+            f"were measured; weights made from Caffe's have none, take B, G, R from 0 to 255 and have strides in the "
+            f"1x1: {CONVERT.format(FROM_CAFFE)}, or --input torch if they are for (x / 255 - mean) / std"
+        )
+
+
+def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, str]) -> None:
+    """Raises InputError when the first layer of canonical arrays shows that they are made for another input.
+
+    assumed: what they were converted from, one of INPUTS; names: in the file, by canonical name
+    """
+    kernel, mean, var = (arrays[f"conv1/{kind}"].astype(np.float64) for kind in ("kernel", "mean", "var"))
+    squares = (kernel**2).sum(axis=(0, 1, 2))
+    live = (squares > 0) & (arrays["conv1/gamma"] != 0)
+    if not live.any():
+        return
+    ratio = float(np.quantile(var[live] / squares[live], 0.75))
+    if not LEAST <= ratio <= MOST:
+        larger = ratio > MOST
+        suggested = FROM_CAFFE if larger else "torch"
+        others = "caffe-rgb" if larger else "tf or unit"
+        raise InputError(
+            f"{names['conv1/var']} = {ratio:.2g} times the squares of {names['conv1/kernel']}, upper quartile: must be "
+            f"{LEAST} to {MOST:.0f}, as from {INPUTS[assumed].text}: made for {'larger' if larger else 'smaller'} "
+            f"values; {CONVERT.format(suggested)} (or {others})"
+        )
+    told = _told_by_means(kernel[..., live], mean[live])
+    if told:
+        raise InputError(
+            f"{names['conv1/mean']} = what pixels of {INPUTS[told].text} give: must be of {INPUTS[assumed].text}; "
+            f"{CONVERT.format(told)}, and --input {assumed} if that is wrong"
+        )
+
+
+def _told_by_means(kernel: np.ndarray, mean: np.ndarray) -> str | None:
+    """The input whose mean is that of the colours that explains the first running means, where it is not 0."""
+    sums = kernel.sum(axis=(0, 1)).T
+    if len(mean) < FEWEST or not mean.any():
+        return None
+    colours = np.linalg.lstsq(sums, mean, rcond=None)[0]
+    if 1 - np.sum((mean - sums @ colours) ** 2) / np.sum(mean**2) < EXPLAINED:
+        return None
+    # In a kernel that is taken for one of y, scale * y + offset has the mean `offset`.
+    for name in ("tf", "unit"):
+        if np.abs(colours - INPUTS[name].offset).max() < NEAR:
+            return name
+    return None
