@@ -156,7 +156,7 @@ def test_a_preset_robot_labels_by_its_own_limits(tmp_path, few):
 
 
 def test_a_robot_and_actions_of_ones_own_are_taken(tmp_path, few):
-    frail = replace(SEEKUR_JR, name="Frail", max_step=1e-6, max_tilt=1.5, track=0.7)
+    frail = replace(SEEKUR_JR, name="Frail", max_step=1e-3, max_tilt=1.5, track=0.7)
     path = tmp_path / "frail.toml"
     path.write_text("\n".join(f"{name} = {json.dumps(value)}" for name, value in asdict(frail).items()))
     done = succeeds(tmp_path / "out", "label", "--count", 1, "--robot", path, "--actions", few, "--no-figures")
@@ -469,7 +469,7 @@ BAD_WORDS = {
     "robot with an unknown key": (["label", "--robot", "BAD/unknown_key.toml"], "unknown key 'wheels'; allowed: "),
     "negative dimension": (
         ["label", "--robot", "BAD/negative.toml"],
-        "BAD/negative.toml: track = -0.663: must be a length in metres, above 0",
+        "BAD/negative.toml: track = -0.663: must be a length in metres from 0.001",
     ),
     "bench with a negative dimension": (["bench", "--robot", "BAD/negative.toml"], "negative.toml: track = -0.663"),
     "missing actions": (["label", "--actions", "BAD/none.toml"], "BAD/none.toml: cannot be read"),

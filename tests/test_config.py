@@ -33,6 +33,9 @@ def ramp_file(tmp_path):
     return write
 
 
+SLOP = "unknown key 'slop'; allowed: length, slope, slope_deg, marks; perhaps slope is meant"
+
+
 def refusal(path) -> str:
     """What load_toml says about a wrong file: one line that starts with the file's name."""
     with pytest.raises(InputError) as raised:
@@ -79,7 +82,7 @@ def test_bytes_that_are_not_text_cannot_be_read(ramp_file):
 
 
 def test_an_unknown_key_is_named_with_the_allowed_ones(ramp_file):
-    assert refusal(ramp_file("length = 1\nslop = 0")) == "unknown key 'slop'; allowed: length, slope, marks"
+    assert refusal(ramp_file("length = 1\nslop = 0")) == SLOP
 
 
 def test_an_unknown_key_in_degrees_is_named_as_written(ramp_file):
@@ -104,7 +107,8 @@ def test_a_refused_value_is_named_with_file_field_and_what_is_allowed(ramp_file)
 
 
 def test_only_angles_may_be_in_degrees(ramp_file):
-    assert refusal(ramp_file("length_deg = 1\nslope = 0")) == "unknown key 'length_deg'; allowed: length, slope, marks"
+    message = refusal(ramp_file("length_deg = 1\nslope = 0"))
+    assert message.startswith("unknown key 'length_deg'; allowed: length, slope, slope_deg, marks")
 
 
 @pytest.mark.parametrize("text", ["slope = 0.1\nslope_deg = 5", "slope_deg = 5\nslope = 0.1"])
@@ -208,7 +212,7 @@ def test_a_list_of_tables_comes_back_from_json(park):
             "[[ramp]]\nlength = -2\nslope = 0",
             "ramp 1: length = -2: must be a length in metres, above 0 and at most 100",
         ),
-        ("[[ramp]]\nlength = 1\nslop = 0", "ramp 1: unknown key 'slop'; allowed: length, slope, marks"),
+        ("[[ramp]]\nlength = 1\nslop = 0", f"ramp 1: {SLOP}"),
         ("[[ramp]]\nlength = 1\nslope_deg = 'a'", "ramp 1: slope_deg = 'a': must be a number of degrees"),
         ("[ramp]\nlength = 1", "ramp = {'length': 1}: must be a list of tables [[ramp]]"),
         ("ramp = 3", "ramp = 3: must be a list of tables [[ramp]]"),
@@ -227,7 +231,7 @@ def test_the_table_of_a_list_that_is_wrong_is_numbered(ramp_file, text, message)
     ("table", "message"),
     [
         ({"length": 1}, "missing slope"),
-        ({"length": 1, "slope": 0, "width": 2}, "unknown key 'width'; allowed: length, slope, marks"),
+        ({"length": 1, "slope": 0, "width": 2}, "unknown key 'width'; allowed: length, slope, slope_deg, marks"),
         ({"length": -1, "slope": 0}, "length = -1: must be a length in metres, above 0 and at most 100"),
     ],
 )

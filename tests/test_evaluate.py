@@ -92,7 +92,7 @@ def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "other", [{"robot": replace(HUSKY, track=0.5)}, {"actions": replace(FEW, turns=3)}, {"grid": replace(GRID, size=5)}]
+    "other", [{"robot": replace(HUSKY, track=0.6)}, {"actions": replace(FEW, turns=3)}, {"grid": replace(GRID, size=5)}]
 )
 def test_a_data_set_of_something_else_is_refused(other):
     with pytest.raises(InputError, match=f"^{next(iter(other))} of the data set: ") as raised:
