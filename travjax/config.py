@@ -11,7 +11,7 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -93,23 +93,34 @@ def load_toml(path: str | Path, kind: type[Config]) -> Config:
         raise InputError(f"{path}: {error}") from None
 
 
-def read_json(path: Path) -> Any:
-    """Reads a JSON file of ours; raises InputError that names it when it is missing, not JSON, or holds no plain numbers."""
-    return _parsed(path, read_text(path), json.loads, "JSON", finite=True)
+def read_json(path: Path, allowed: str = "", finite: bool = True) -> Any:
+    """Reads a JSON file of ours; what is wrong with it is an InputError that names it, as `read_text` says."""
+    return parse_json(read_text(path, allowed), path, finite)
 
 
-def parse_json(text: str, where: object) -> Any:
-    """Returns what a JSON text holds; raises InputError that begins with `where`, as `read_json` does."""
-    return _parsed(where, text, json.loads, "JSON", finite=True)
+def parse_json(text: str, where: object, finite: bool = True) -> Any:
+    """Returns what a JSON text holds.
+
+    Raises InputError that begins with `where` when it is not JSON, is nested too deep, or holds a whole number beyond
+    64 bits or, with `finite`, a number that is not finite.
+    """
+    return _parsed(where, text, json.loads, "JSON", finite)
 
 
-def read_text(path: Path) -> str:
-    """Reads a text file of ours; raises InputError that names it when it is missing, too large or not UTF-8."""
+def read_text(path: Path, allowed: str = "") -> str:
+    """Reads a text file of ours.
+
+    Raises InputError that names it when it is missing, in which case it also says what is allowed, too large or not
+    UTF-8.
+    """
+    data = bytearray()
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            while len(data) <= LARGEST and (piece := file.read(1 << 20)):
+                data += piece
     except (OSError, ValueError) as error:  # ValueError: a name with a NUL byte
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read: {reason}{allowed and f'; allowed: {allowed}'}") from None
     if len(data) > LARGEST:
         raise InputError(f"{path}: cannot be read: must be a text of at most {LARGEST >> 20} MiB")
     try:
@@ -170,13 +181,21 @@ def to_json(config: object) -> dict[str, Any]:
     return {field.name: plain(getattr(config, field.name)) for field in dataclasses.fields(config)}  # type: ignore[arg-type]
 
 
-def from_json(table: dict[str, Any], kind: type[Config]) -> Config:
+def from_json(table: Any, kind: type[Config]) -> Config:
     """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
     require(isinstance(table, dict), kind.__name__, table, "a table")
     infinite = {"inf": math.inf, "-inf": -math.inf}
     number = lambda item: infinite.get(item, item) if isinstance(item, str) else item
     lists = {key: [number(item) for item in value] for key, value in table.items() if type(value) is list}
     return kind(**_fields_from(table | lists, kind))  # tables within a table hold no infinite numbers
+
+
+def parts_from_json(table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Returns the configurations that a table has under names; raises InputError that says what is missing or wrong."""
+    missing = [name for name in kinds if not isinstance(table, dict) or name not in table]
+    if missing:
+        raise InputError(f"missing {', '.join(missing)}")
+    return {name: from_json(table[name], kind) for name, kind in kinds.items()}
 
 
 def _fields_from(table: dict, kind: type) -> dict:

@@ -11,6 +11,7 @@ import numpy as np
 
 from travjax.actions import ActionSpace
 from travjax.batching import BATCH
+from travjax.config import one_line
 from travjax.dem import Windows
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -79,4 +80,4 @@ def title(maps: Batch, index: int) -> str:
     """One line that tells a map from the others: its group, and its seed or south-west corner."""
     seed = "seed" in maps
     where = f"seed {maps['seed'][index]}" if seed else "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])
-    return f"{maps['group'][index][:30]}, {where}"
+    return f"{one_line(maps['group'][index], 30)}, {where}"

@@ -198,7 +198,7 @@ def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path,
     """What `make` makes; `total` maps, if that is known before."""
     _require_free(folder)
     try:
-        with tqdm(desc="making", total=total, unit="map") as bar:
+        with tqdm(desc="making", total=total, unit="map", delay=0.1) as bar:  # none where a file is refused at once
             dataset = make(bar.update)
     except MemoryError as error:
         raise InputError(f"{what}: do not fit in memory: {error}") from None

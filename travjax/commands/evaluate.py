@@ -10,9 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from travjax.commands import options
-from travjax.config import InputError, require
+from travjax.config import InputError, one_line, require
 from travjax.files import output_folder, written_whole
-from travjax.models import RESNET
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,11 +28,6 @@ FIGURE_MAPS = 2
 """Maps in predictions.png, likewise."""
 
 MARGINS = "regressed margins above their limits"
-
-CALIBRATION = (
-    "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by "
-    "how much); choose a threshold from the table above."
-)
 
 
 def add(commands: options.Commands) -> None:
@@ -191,7 +185,7 @@ def _write_tables(
         (headline + "step {steps}").format(**description),
         report.metrics_table(scores, paper),
         report.threshold_table(scores, paper),
-        *([CALIBRATION] if evaluator.run.preset.model == RESNET else []),
+        report.calibration_line(scores),
         report.groups_table(scores),
         report.baselines_table(average_precisions),
     ]
@@ -247,7 +241,7 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Fi
     with tqdm(desc="maps for the figure", total=len(shown) * len(trained.actions), unit="sample") as bar:
         probability = evaluator.whole_maps(estimator, shown, bar.update)
     failed, known = map(np.asarray, unpacked(data.labels[shown]))
-    titles = [f"{data.group[index]}, map {index}" for index in shown]
+    titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]
     return plots.predicted_maps(
         data.heights[shown],
         {"predicted": probability},

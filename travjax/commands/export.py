@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from travjax.commands import options
-from travjax.config import InputError
+from travjax.config import InputError, read_text
 from travjax.files import written_whole
 from travjax.models import FIELD
 
@@ -48,7 +48,7 @@ def _card(folder: Path, trained, notes: dict, name: str) -> str:
     preset, tables = trained.preset, folder / "evaluation" / "tables.txt"
     grid, actions, seen = trained.grid, trained.actions, preset.corruption
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
-    measured = tables.read_text().strip() if tables.exists() else "not evaluated: `travjax evaluate` writes the tables"
+    measured = read_text(tables).strip() if tables.exists() else "not evaluated: `travjax evaluate` writes the tables"
     field = preset.model == FIELD
     corrupted = (
         f"| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"

@@ -9,7 +9,7 @@ from travjax import report, traverse
 from travjax.actions import ActionSpace
 from travjax.clouds import SUFFIXES
 from travjax.commands import options
-from travjax.config import require
+from travjax.config import one_line, require
 from travjax.dem import load_dem
 from travjax.files import output_folder, save_npz, written_whole
 from travjax.grid import Grid
@@ -84,10 +84,11 @@ def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterat
         windows = load_dem(path, grid=grid, **settings)
         crs = windows.crs or "none"
         crs = crs.split('"')[1] if '"' in crs else crs  # of a system without a code, the name
-        print(
+        said = (
             f"{path}: {len(windows.heights)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
             f"crs {crs}, {windows.filled:.3%} filled in small holes, {windows.unknown:.1%} unknown"
         )
+        print(one_line(said))
         files.append((path.name if names.count(path.name) == 1 else str(path), windows))
         read = {
             name: getattr(windows, name)

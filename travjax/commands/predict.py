@@ -15,6 +15,11 @@ from travjax.models import MODELS
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
 
+SIMULATOR = "simulator on the map"
+
+AGAINST = "Against the simulator on the map as given, its noise included"
+"""What stands above the table of `--check`."""
+
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
@@ -31,7 +36,11 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument("--model", choices=MODELS, help="what the estimator must be")
     parser.add_argument("--robot", metavar="R", help="what the estimator must have been trained for")
-    parser.add_argument("--check", action="store_true", help="the exact simulator beside it")
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="the simulator beside it, on the map as given: it takes the noise of a map for ground",
+    )
     options.add_synthetic(parser, count=20, each="maps in all, the styles in turn")
     options.add_dem(parser, stride=8.0)
     parser.add_argument("--no-figures", action="store_true", help="write no figures")
@@ -82,16 +91,16 @@ def _simulated(batch: Batch, predictor) -> Batch:
 
 
 def _checked(maps: Batch, probability: np.ndarray) -> str:
-    """The predictions against the exact simulator on the same maps."""
+    """The predictions against the simulator on the maps as given; on noisy ones that is not what a robot meets."""
     from travjax import metrics, report
 
     known = maps["known"]
     scores = metrics.evaluate(probability[known], maps["failed"][known])
-    return "Against the exact simulator:\n" + report.metrics_table(scores, None)
+    return f"{AGAINST}:\n{report.metrics_table(scores, None)}"
 
 
 def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: Path) -> Path:
-    """The action space of a few maps in safe, doubtful and failing, the simulator's beside it with `check`."""
+    """The action space of a few maps in safe, doubtful and failing; with `check` the simulator's below, map as given."""
     from travjax import plots
 
     shown, trained = samples(maps), predictor.run
@@ -105,5 +114,6 @@ def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: P
         trained.robot,
         trained.actions,
         trained.grid,
+        SIMULATOR,
     )
     return plots.save(figure, out / "predictions.png")
