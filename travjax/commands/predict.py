@@ -100,7 +100,7 @@ def _checked(maps: Batch, probability: np.ndarray) -> str:
 
 
 def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: Path) -> Path:
-    """The action space of a few maps in safe, doubtful and failing; with `check` the simulator's below, map as given."""
+    """The action space of a few maps in safe, doubtful and failing; `check` adds the simulator's below it."""
     from travjax import plots
 
     shown, trained = samples(maps), predictor.run
