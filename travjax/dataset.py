@@ -35,7 +35,7 @@ from travjax.grid import Grid
 from travjax.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
 from travjax.robot import Robot
 from travjax.sampling import UNKNOWN, random_keys
-from travjax.terrain import STYLES, generate_terrain
+from travjax.terrain import STYLES, generate_terrain, require_world
 from travjax.traverse import failures, packed, simulate
 
 FORMAT, FORMAT_VERSION = "travjax data set", 1
@@ -56,12 +56,14 @@ class DatasetConfig:
     maps:             number of maps, the five styles in turn
     seed:             gives the terrain seeds and the splits
     validation, test: shares of the maps, the rest is for training
+    world:            metres, the map size that features are derived from; the maps' own unless given
     """
 
     maps: int = 56_840
     seed: int = 0
     validation: float = 0.08
     test: float = 0.02
+    world: float | None = None
 
     def __post_init__(self):
         whole = lambda value: isinstance(value, Integral) and not isinstance(value, bool)
@@ -70,6 +72,7 @@ class DatasetConfig:
         for name in ("validation", "test"):
             require_number(name, getattr(self, name), -math.inf, 1, "a share from 0 to 1")
             require(getattr(self, name) >= 0, name, getattr(self, name), "a share from 0 to 1")
+        require_world(self.world)
         require(self.validation + self.test <= 1, "validation + test", self.validation + self.test, "at most 1")
 
     def styles(self) -> np.ndarray:
@@ -203,7 +206,7 @@ def generate(
     labels = np.empty((config.maps, len(actions)), np.uint8)
     for start in range(0, config.maps, CHUNK):
         chunk = slice(start, min(start + CHUNK, config.maps))
-        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid)
+        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid, world=config.world)
         margins = simulate(made, robot, actions, grid=grid)
         labels[chunk] = packed(failures(margins, robot), margins.known)
         heights[chunk] = made

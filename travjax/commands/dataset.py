@@ -18,7 +18,7 @@ from travjax.provenance import SIDES, Site, SitesConfig, Strip
 from travjax.robot import Robot
 from travjax.statistics import statistics_table, windows_table
 
-SYNTHETIC = ("maps", "seed", "validation", "test")
+SYNTHETIC = ("maps", "seed", "validation", "test", "world")
 """The options of a synthetic data set."""
 
 REAL = ("test_strip", "validation_strip", "gap", "max_unknown", "no_rotations", *options.DEM_OPTIONS)
@@ -47,6 +47,7 @@ def add(commands: options.Commands) -> None:
         parser.add_argument(
             f"--{name}", type=float, default=share, metavar="SHARE", help=f"share of the maps for {name} ({share:g})"
         )
+    options.add_world(parser)
     _add_real(parser)
     options.add_robot(parser)
     options.add_grid(parser)
@@ -184,6 +185,7 @@ def _strip(name: str, given: list[str] | None) -> Strip:
 
 def made(config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
     """A new synthetic data set, saved in a folder, with progress bars."""
+    options.say_world(config.world, grid)
     make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
     return _saved(make, config.maps, folder, f"--maps = {config.maps}")
 

@@ -48,7 +48,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     as_in_paper = not arguments.dem and traverse.as_in_paper(robot, actions)
     table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
-    config = options.configuration_json(robot, actions, grid, files=files)
+    config = options.configuration_json(robot, actions, grid, files=files, world=arguments.world)
     labels = save_npz(out / "labels.npz", config=config, cell_size=grid.spacing, **maps)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(table + "\n")
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of maps, batches of them, and how each DEM file was read."""
-    unused = ("style", "count", "seed") if arguments.dem else options.DEM_OPTIONS
+    unused = ("style", "count", "seed", "world") if arguments.dem else options.DEM_OPTIONS
     for name in unused:
         given = getattr(arguments, name)
         allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
@@ -72,7 +72,8 @@ def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Ba
         return _dem_windows(arguments, grid)
     styles, total, seed = arguments.style or list(STYLES), options.count(arguments), options.seed(arguments)
     names = [styles[number % len(styles)] for number in range(total)]
-    return total, synthetic_batches(names, list(range(seed, seed + total)), grid), []
+    options.say_world(arguments.world, grid)
+    return total, synthetic_batches(names, list(range(seed, seed + total)), grid, arguments.world), []
 
 
 def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:

@@ -75,7 +75,9 @@ def run(arguments: argparse.Namespace) -> None:
         arrays |= {f"margin_{name}": predicted.margins[..., k] for k, name in enumerate(("step", "obstacle", "tilt"))}
     if arguments.check:
         arrays |= {"failed": maps["failed"]}
-    config = options.configuration_json(trained.robot, trained.actions, trained.grid, files=files, model=model)
+    config = options.configuration_json(
+        trained.robot, trained.actions, trained.grid, files=files, model=model, world=arguments.world
+    )
     saved = save_npz(out / "predictions.npz", config=config, cell_size=trained.grid.spacing, **arrays)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(text + "\n")
