@@ -337,6 +337,18 @@ def test_several_predictions_stand_below_each_other_and_the_truth_is_last(tmp_pa
     assert sorted(shown, key=lambda ax: -ax.get_window_extent().y0) == shown
 
 
+def test_every_so_many_trajectories_are_said_to_be_that():
+    shown, known = np.zeros((1, 8, 3)), np.ones((1, 8), bool)
+    heights = np.zeros((1, *GRID.shape), np.float32)
+    settings = (["one"], SEEKUR_JR, FEW, GRID)
+    figure = plots.predicted_maps(heights, {"predicted": shown}, shown > 1, known, *settings, "simulator", every=5)
+    assert figure.get_suptitle() == "8 of the 36 trajectories of Seekur Jr"
+    above, below = (ax for ax in figure.axes if ax.get_title().startswith("step, "))
+    assert below.get_title() == "step, simulator: 0.0% of known fail"
+    lines = next(lines for lines in above.collections if len(lines.get_segments()))
+    np.testing.assert_allclose(lines.get_segments(), FEW.poses(np.arange(0, 36, 5))[..., :2], rtol=0, atol=1e-12)
+
+
 def test_the_trajectory_that_is_predicted_to_fail_turns_red():
     probabilities = np.zeros((1, 36, 3))
     probabilities[0, FEW.index(3, 2, 1), 1] = 0.8

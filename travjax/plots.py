@@ -113,13 +113,15 @@ def predicted_maps(
     actions: ActionSpace,
     grid: Grid,
     labelled: str = "true",
+    every: int = 1,
 ) -> Figure:
     """For each map the elevation and, for each event, the action space as predicted and in the last row as labelled.
 
     heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3], None if that is
-    not to be shown; known: [n, t]; labelled: what the last row is called. The paper's qualitative figure.
+    not to be shown; known: [n, t]; labelled: what the last row is called; every: t are every so many of the action
+    space. The paper's qualitative figure.
     """
-    paths = actions.poses(np.arange(len(actions)))[..., :2]
+    paths = actions.poses(np.arange(0, len(actions), every))[..., :2]
     rows = len(predictions) + (failed is not None)
     figure = Figure(figsize=(13, 3.15 * rows * len(heights) + 0.5), layout="constrained")
     axes = figure.subplots(rows * len(heights), 4, sharex=True, sharey=True, squeeze=False)
@@ -151,7 +153,8 @@ def predicted_maps(
         axes[1, 0].legend(handles=bands, loc="center")
     else:
         figure.legend(handles=bands, loc="outside lower center", ncols=len(bands))
-    figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
+    shown = f"{len(paths)} of the {len(actions)}" if every > 1 else f"{len(actions)}"
+    figure.suptitle(f"{shown} trajectories of {robot.name}", x=0.02, ha="left")
     return figure
 
 

@@ -123,7 +123,7 @@ def evaluate(
         errors = np.abs(predicted - true).mean(axis=0) * np.asarray(trained.robot.limits)
         others[MARGINS] = evaluator.scores(np.clip(predicted / 2, 0, 1), samples, recalls)  # 0.5 is the limit
     _write_tables(out, scores, others, description, evaluator, errors)
-    _draw(out, evaluator, estimator, scores, others, figure_maps)
+    _draw(out, evaluator, estimator, scores, others, figure_maps, len(samples[0]))
     return scores
 
 
@@ -221,6 +221,7 @@ def _draw(
     scores: "Evaluation",
     others: Mapping[str, "Evaluation"],
     maps: int,
+    samples: int,
 ) -> None:
     from travjax import curves, plots
 
@@ -228,19 +229,24 @@ def _draw(
     print(plots.save(figure, out / "precision_recall.png"))
     print(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
     if maps:
-        print(plots.save(_predictions(evaluator, estimator, maps), out / "predictions.png"))
+        print(plots.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
 
 
-def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Figure":
-    """Prediction over truth on the whole action space of test maps that fail neither nowhere nor everywhere."""
+def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, samples: int) -> "Figure":
+    """Prediction over truth on the action space of test maps that fail neither nowhere nor everywhere.
+
+    samples: those that were evaluated; where they are few, not all trajectories are shown
+    """
     from travjax import plots
     from travjax.traverse import unpacked
 
     data, trained = evaluator.dataset, evaluator.run
     shown = evaluator.to_show(maps)
-    with tqdm(desc="maps for the figure", total=len(shown) * len(trained.actions), unit="sample") as bar:
-        probability = evaluator.whole_maps(estimator, shown, bar.update)
-    failed, known = map(np.asarray, unpacked(data.labels[shown]))
+    every = evaluator.every(len(shown), samples)
+    labels = data.labels[shown, ::every]
+    with tqdm(desc="maps for the figure", total=labels.size, unit="sample") as bar:
+        probability = evaluator.whole_maps(estimator, shown, bar.update, every)
+    failed, known = map(np.asarray, unpacked(labels))
     titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]
     return plots.predicted_maps(
         data.heights[shown],
@@ -251,4 +257,5 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Fi
         trained.robot,
         trained.actions,
         trained.grid,
+        every=every,
     )

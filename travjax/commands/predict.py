@@ -15,7 +15,8 @@ from travjax.models import MODELS
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
 
-SIMULATOR = "simulator on the map"
+SIMULATOR = "simulator\non the map as given"
+"""What a figure calls the row below the predictions."""
 
 AGAINST = "Against the simulator on the map as given, its noise included"
 """What stands above the table of `--check`."""
