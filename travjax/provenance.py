@@ -156,7 +156,7 @@ class SiteRecord:
             require_number(name, getattr(self, name), -math.inf, math.inf, "a number")
         for name in ("windows", *SPLITS, "too_unknown", "near_test", "shared"):
             value = getattr(self, name)
-            require(type(value) is int and value >= 0, name, value, "a whole number, at least 0")
+            require(type(value) is int and 0 <= value < 2**63, name, value, "a whole number, at least 0")
 
 
 @dataclass(frozen=True, eq=False)

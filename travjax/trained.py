@@ -148,7 +148,7 @@ def checked_meta(meta: dict, folder: str | Path) -> dict:
     require(meta.get("optimizer") in (0, 1, 2), f"{where}: optimizer", meta.get("optimizer"), "0, 1 or 2")
     require(isinstance(meta.get("dataset"), str), f"{where}: dataset", meta.get("dataset"), "a fingerprint")
     counted = all(type(position.get(name)) is int and position[name] >= 0 for name in COUNTS)
-    summed = all(type(position.get(name)) in (int, float) and math.isfinite(position[name]) for name in SUMS)
+    summed = all(type(position.get(name)) in (int, float) and abs(position[name]) < math.inf for name in SUMS)
     whole = counted and summed and position["phase"] in (1, 2) and len(position) == len(COUNTS + SUMS)
     require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
     return meta

@@ -21,7 +21,7 @@ from travjax.files import output_folder, save_npz
 from travjax.imagenet import load_weights
 from travjax.models import FIELD
 from travjax.parallel import Devices
-from travjax.preset import TrainingConfig, find_weights
+from travjax.preset import MOST, TrainingConfig, find_weights
 from travjax.runlog import read_rows
 from travjax.sampling import Samples, natural_sample
 from travjax.train import Trainer
@@ -65,8 +65,9 @@ class TransferConfig:
             require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
         for name in ("each", "shown_maps"):
             value = getattr(self, name)
-            require(type(value) is int and value >= 0, name, value, "a whole number, at least 0")
-        whole = bool(self.seeds) and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
+            require(type(value) is int and 0 <= value <= MOST, name, value, f"a whole number from 0 to {MOST}")
+        whole = isinstance(self.seeds, tuple) and bool(self.seeds)
+        whole = whole and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
         allowed = "different whole numbers from 0, at least one"
         require(whole and len(set(self.seeds)) == len(self.seeds), "seeds", self.seeds, allowed)
         both = self.training.head_epochs and self.training.epochs

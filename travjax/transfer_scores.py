@@ -67,7 +67,8 @@ def _is_scored(row: Mapping) -> bool:
     counts = [
         at(at(at(site, name), "confusion"), count) for site in sites.values() for name in NAMES for count in COUNTS
     ]
-    validated = precision is None or type(at(precision, OVERALL)) in (int, float, type(None))
+    overall = at(precision, OVERALL) if isinstance(precision, Mapping) and OVERALL in precision else "none"
+    validated = precision is None or type(overall) in (int, float, type(None))
     return validated and all(type(count) is int and count >= 0 for count in counts)
 
 
