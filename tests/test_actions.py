@@ -224,11 +224,11 @@ def test_other_than_two_arcs_are_refused(arc_lengths):
         ActionSpace(arc_lengths=arc_lengths)
 
 
-@pytest.mark.parametrize("length", [0, -1, 1001, math.nan, math.inf, "1", None, True])
+@pytest.mark.parametrize("length", [0, 1e-40, -1, 1001, math.nan, math.inf, "1", None, True])
 @pytest.mark.parametrize("arc", [0, 1])
 def test_a_bad_arc_length_is_refused(length, arc):
     lengths = (length, 1.65) if arc == 0 else (1.65, length)
-    with pytest.raises(InputError, match="^arc_lengths = .*: must be lengths in metres, above 0 and at most 1000$"):
+    with pytest.raises(InputError, match="^arc_lengths = .*: must be a length in metres from 0.001 to 1000$"):
         ActionSpace(arc_lengths=lengths)
 
 
@@ -238,9 +238,13 @@ def test_no_radii_are_refused(radii):
         ActionSpace(radii=radii)
 
 
-@pytest.mark.parametrize("radius", [0, -math.inf, math.nan, "1", None, True, (1.0,)])
+@pytest.mark.parametrize(
+    "radius",
+    [0, 1e-40, -0.0009, 1e13, pytest.param(10**5000, id="digits"), -math.inf, math.nan, "1", None, True, (1.0,)],
+)
 def test_a_bad_radius_is_refused(radius):
-    with pytest.raises(InputError, match="^radii = .*: must be a radius in metres, not 0; inf is straight$"):
+    allowed = r"a radius in metres from 0.001 to 1e12, \+ or -; inf is straight"
+    with pytest.raises(InputError, match=f"^radii = .*: must be {allowed}$"):
         ActionSpace(radii=(1.5, radius))
 
 
@@ -249,16 +253,18 @@ def test_a_radius_twice_is_refused():
         ActionSpace(radii=(1.5, math.inf, 1.5))
 
 
-@pytest.mark.parametrize("interval", [0, -0.06, 0.51, math.nan, math.inf, "0.06", None, True])
+@pytest.mark.parametrize("interval", [0, 1e-40, -0.06, 0.51, math.nan, math.inf, "0.06", None, True])
 def test_a_bad_interval_is_refused(interval):
-    with pytest.raises(InputError, match="^interval = .*: must be a length in metres, at most an arc's length$"):
+    with pytest.raises(
+        InputError, match="^interval = .*: must be a length in metres, from 0.001 and at most an arc's length$"
+    ):
         ActionSpace(arc_lengths=(0.5, 1.0), interval=interval)
 
 
 def test_an_interval_that_makes_thousands_of_poses_is_refused():
     assert ActionSpace(turns=1, arc_lengths=(0.5, 1.0), interval=0.001).poses(0).shape == (1501, 3)
-    with pytest.raises(InputError, match="^interval = 0.00099: must be at least a thousandth of an arc, 0.001 m$"):
-        ActionSpace(turns=1, arc_lengths=(0.5, 1.0), interval=0.00099)
+    with pytest.raises(InputError, match="^interval = 0.00199: must be at least a thousandth of an arc, 0.002 m$"):
+        ActionSpace(turns=1, arc_lengths=(0.5, 2.0), interval=0.00199)
 
 
 def test_too_many_trajectories_are_refused():

@@ -156,7 +156,7 @@ def test_a_preset_robot_labels_by_its_own_limits(tmp_path, few):
 
 
 def test_a_robot_and_actions_of_ones_own_are_taken(tmp_path, few):
-    frail = replace(SEEKUR_JR, name="Frail", max_step=1e-6, max_tilt=1.5, track=0.7)
+    frail = replace(SEEKUR_JR, name="Frail", max_step=1e-3, max_tilt=1.5, track=0.7)
     path = tmp_path / "frail.toml"
     path.write_text("\n".join(f"{name} = {json.dumps(value)}" for name, value in asdict(frail).items()))
     done = succeeds(tmp_path / "out", "label", "--count", 1, "--robot", path, "--actions", few, "--no-figures")
@@ -165,6 +165,40 @@ def test_a_robot_and_actions_of_ones_own_are_taken(tmp_path, few):
     assert arrays["failed"][..., 0].all()
     assert not arrays["failed"][..., 2].any()
     np.testing.assert_array_equal(arrays["tilt"], travjax.simulate(arrays["heights"], frail, FEW).tilt)
+
+
+@pytest.mark.parametrize("command", ["label", "terrain", "dataset"])
+def test_a_world_makes_the_same_ground_on_a_larger_map(tmp_path, few, command):
+    words = {
+        "label": ("label", "--count", 5, "--actions", few, "--no-figures"),
+        "terrain": ("terrain", "--count", 1),
+        "dataset": ("dataset", "--maps", 5, "--actions", few),
+    }[command]
+
+    def heights(name: str, *more) -> tuple[np.ndarray, str]:
+        done = succeeds(tmp_path / name, *words, "--spacing", 0.125, *more)
+        files = {"label": "labels.npz", "terrain": "terrain.npz"}
+        return np.load(done.folder / "heights.npy") if command == "dataset" else done.arrays(files[command])[
+            "heights"
+        ], done.out
+
+    small, said = heights("small")
+    assert "features" not in said
+    large, said = heights("large", "--size", 12, "--world", 8)
+    np.testing.assert_array_equal(large[:, 16:81, 16:81], small)
+    assert "synthetic maps of 12 m with the features of 8 m maps\n" in said
+    grown, said = heights("grown", "--size", 12)
+    assert not np.array_equal(grown, large)
+    assert "synthetic maps of 12 m: their features grow with the map; a world of 8 m makes the ground" in said
+
+
+def test_the_world_is_recorded(tmp_path, few):
+    words = ("--size", 12, "--spacing", 0.25, "--world", 8)
+    done = succeeds(tmp_path / "label", "label", "--count", 1, "--actions", few, "--no-figures", *words)
+    assert json.loads(str(done.arrays()["config"]))["world"] == 8
+    assert succeeds(tmp_path / "terrain", "terrain", "--count", 1, *words).arrays("terrain.npz")["world"] == 8
+    made = succeeds(tmp_path / "set", "dataset", "--maps", 5, "--actions", few, *words)
+    assert json.loads((made.folder / "dataset.json").read_text())["config"]["world"] == 8
 
 
 def test_size_and_spacing_make_another_grid(tmp_path, few):
@@ -469,7 +503,7 @@ BAD_WORDS = {
     "robot with an unknown key": (["label", "--robot", "BAD/unknown_key.toml"], "unknown key 'wheels'; allowed: "),
     "negative dimension": (
         ["label", "--robot", "BAD/negative.toml"],
-        "BAD/negative.toml: track = -0.663: must be a length in metres, above 0",
+        "BAD/negative.toml: track = -0.663: must be a length in metres from 0.001",
     ),
     "bench with a negative dimension": (["bench", "--robot", "BAD/negative.toml"], "negative.toml: track = -0.663"),
     "missing actions": (["label", "--actions", "BAD/none.toml"], "BAD/none.toml: cannot be read"),

@@ -111,7 +111,9 @@ def test_the_simulator_stands_beside_the_predictions(done, heights):
     assert 0 < failed.mean() < 0.5
     scores = metrics.evaluate(arrays["probability"].reshape(-1, 3), failed.reshape(-1, 3))
     text = (done.folder / "shares.txt").read_text()
-    assert text.endswith(f"\n\nAgainst the exact simulator:\n{report.metrics_table(scores, None)}\n")
+    assert text.endswith(
+        f"\n\nAgainst the simulator on the map as given, its noise included:\n{report.metrics_table(scores, None)}\n"
+    )
     counts = [getattr(scores.scores["step"].confusion, name) for name in ("tn", "fp", "fn", "tp")]
     row = next(line for line in text.splitlines()[-8:] if line.startswith("step "))
     assert [int(word) for word in row.split()[-4:]] == counts

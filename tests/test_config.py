@@ -7,7 +7,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from travjax.config import InputError, from_json, load_toml, require, require_number, to_json
+from travjax.config import (
+    InputError,
+    from_json,
+    load_toml,
+    one_line,
+    parse_json,
+    read_json,
+    require,
+    require_number,
+    shown,
+    to_json,
+)
 
 
 @dataclass(frozen=True)
@@ -31,6 +42,9 @@ def ramp_file(tmp_path):
         return path
 
     return write
+
+
+SLOP = "unknown key 'slop'; allowed: length, slope, slope_deg, marks; perhaps slope is meant"
 
 
 def refusal(path) -> str:
@@ -78,8 +92,81 @@ def test_bytes_that_are_not_text_cannot_be_read(ramp_file):
     assert refusal(ramp_file(b"length = \xff\xfe")).startswith("cannot be read: ")
 
 
+HOSTILE = {
+    "deep": ("marks = " + "[" * 3000, "lists and tables: must be nested 50 deep at most"),
+    "deep and closed": (f"marks = {'[' * 60}{']' * 60}", "marks = '...': must be nested 50 deep at most"),
+    "deep tables": ("[" + ".".join("a" * 60) + "]", "a.a.a."),
+    "digits": (
+        f"slope = 0\nlength = {'9' * 5000}",
+        "line 2: 99999999999999999999 ...: must be a number of fewer digits",
+    ),
+    "hexadecimal": (f"length = 0x{'f' * 5000}", "length = 0xffff"),
+    "beyond 64 bits": (f"marks = [1, {2**64}]", "marks[1] = 18446744073709551616: must be a whole number of 64 bits"),
+    "in degrees": (f"slope_deg = 0x{'f' * 5000}", "slope_deg = 0xffff"),
+    "twice": (f"slope = 1\nslope_deg = 0x{'f' * 5000}", "slope_deg = 0xffff"),
+    "NUL": ("length = 1\x00", "not a TOML file: "),
+    "UTF-16": ("length = 1".encode("utf-16"), "cannot be read: byte 0 is not UTF-8"),
+    "a long key": (f"{'k' * 5000} = 1", "unknown key 'kkkk"),
+    "a key of two lines": ('"a\\nb" = 1', "unknown key 'a\\nb'; allowed: "),
+    "a value of two lines": ('slope = 0\nlength = "a\\nb\\u001b"', "length = 'a\\nb\\x1b': must be "),
+    "a date": ("slope = 0\nlength = 1979-05-27", "length = datetime.date(1979, 5, 27): must be "),
+}
+
+
+@pytest.mark.parametrize("what", HOSTILE)
+def test_what_no_file_of_ours_holds_is_refused_in_one_line(ramp_file, what):
+    text, message = HOSTILE[what]
+    said = refusal(ramp_file(text))
+    assert said.startswith(message) and len(said) < 600 and said.isprintable()
+
+
+def test_a_byte_order_mark_is_passed_over(ramp_file):
+    assert load_toml(ramp_file(b"\xef\xbb\xbflength = 1\r\nslope = 0\r\n"), Ramp) == Ramp(1, 0)
+
+
+def test_a_name_with_a_nul_byte_is_one_line():
+    with pytest.raises(InputError, match=r"^no\\x00ne.toml: cannot be read: embedded null byte$"):
+        load_toml("no\x00ne.toml", Ramp)
+
+
+def test_a_file_that_does_not_end_is_refused(monkeypatch):
+    monkeypatch.setattr("travjax.config.LARGEST", 1 << 20)
+    with pytest.raises(InputError, match="^/dev/zero: cannot be read: must be a text of at most 1 MiB$"):
+        load_toml("/dev/zero", Ramp)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON: "),
+        ('{"a": [1, NaN]}', "a[1] = nan: must be a finite number"),
+        ('{"a": {"b": -Infinity}}', "a.b = -inf: must be a finite number"),
+        ('{"a": 1e999}', "a = inf: must be a finite number"),
+        (f'{{"a": {2**64}}}', f"a = {2**64}: must be a whole number of 64 bits"),
+        (f'{{"a": {"9" * 5000}}}', "line 1: 99999999999999999999 ...: must be a number of fewer digits"),
+        ("[" * 100_000, "lists and tables: must be nested 50 deep at most"),
+        ('{"a": ' * 60 + "1" + "}" * 60, "a.a.a."),
+    ],
+)
+def test_json_that_is_none_of_ours_is_refused_in_one_line(tmp_path, text, message):
+    path = tmp_path / "a.json"
+    path.write_text(text)
+    with pytest.raises(InputError) as raised:
+        read_json(path)
+    assert str(raised.value).startswith(f"{path}: {message}") and len(str(raised.value)) < 600
+
+
+def test_json_is_read_as_it_is(tmp_path):
+    held = {"a": [1, 2.5, None, True, "x"], "b": {"c": -(2**63), "d": 2**64 - 1}}
+    (tmp_path / "a.json").write_text(json.dumps(held))
+    assert read_json(tmp_path / "a.json") == held
+    assert parse_json("[Infinity, NaN]", "text", finite=False)[0] == math.inf
+    with pytest.raises(InputError, match="none.json: cannot be read: No such file or directory; allowed: a run$"):
+        read_json(tmp_path / "none.json", "a run")
+
+
 def test_an_unknown_key_is_named_with_the_allowed_ones(ramp_file):
-    assert refusal(ramp_file("length = 1\nslop = 0")) == "unknown key 'slop'; allowed: length, slope, marks"
+    assert refusal(ramp_file("length = 1\nslop = 0")) == SLOP
 
 
 def test_an_unknown_key_in_degrees_is_named_as_written(ramp_file):
@@ -104,7 +191,8 @@ def test_a_refused_value_is_named_with_file_field_and_what_is_allowed(ramp_file)
 
 
 def test_only_angles_may_be_in_degrees(ramp_file):
-    assert refusal(ramp_file("length_deg = 1\nslope = 0")) == "unknown key 'length_deg'; allowed: length, slope, marks"
+    message = refusal(ramp_file("length_deg = 1\nslope = 0"))
+    assert message.startswith("unknown key 'length_deg'; allowed: length, slope, slope_deg, marks")
 
 
 @pytest.mark.parametrize("text", ["slope = 0.1\nslope_deg = 5", "slope_deg = 5\nslope = 0.1"])
@@ -131,6 +219,38 @@ def test_a_long_value_is_shortened_to_one_line():
     assert message.startswith("field = array([[0., 0., ")
     assert message.endswith(" ...: must be small")
     assert "\n" not in message and len(message) < 120
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("a name\nof two\r\nlines", "a name\\nof two\\r\\nlines"),
+        ("\x1b[31mred\x07 \u202e \x00", "\\x1b[31mred\\x07 \\u202e \\x00"),
+        ("\udcff.tif \u2028", "\\udcff.tif \\u2028"),
+        ("Gelände 山 a\\nb", "Gelände 山 a\\nb"),
+    ],
+)
+def test_a_message_is_one_line_whatever_names_hold(text, line):
+    assert str(InputError(text)) == one_line(text) == line
+    assert str(InputError(InputError(text))) == line
+
+
+def test_a_long_message_keeps_its_ends():
+    message = str(InputError(f"FILE: {'x y ' * 5000}: must be short"))
+    assert len(message) <= 600 and message.startswith("FILE: x y x y") and message.endswith(" x y : must be short")
+    assert " ... " in message and one_line("y" * 600) == "y" * 600
+    assert one_line("0123456789" * 5, 20) == "012345678 ... 456789"
+
+
+def test_a_value_without_spaces_is_cut_off_as_well():
+    assert shown("x" * 5000) == f"'{'x' * 75} ..."
+
+
+@pytest.mark.parametrize("value", [10**5000, [10**5000], (1, [10**5000])], ids=["alone", "list", "inside"])
+def test_a_number_that_python_does_not_write_can_be_quoted(value):
+    assert len(shown(value)) <= 80
+    with pytest.raises(InputError, match="^field = .*: must be small$"):
+        require(False, "field", value, "small")
 
 
 def test_what_holds_is_not_refused():
@@ -208,7 +328,7 @@ def test_a_list_of_tables_comes_back_from_json(park):
             "[[ramp]]\nlength = -2\nslope = 0",
             "ramp 1: length = -2: must be a length in metres, above 0 and at most 100",
         ),
-        ("[[ramp]]\nlength = 1\nslop = 0", "ramp 1: unknown key 'slop'; allowed: length, slope, marks"),
+        ("[[ramp]]\nlength = 1\nslop = 0", f"ramp 1: {SLOP}"),
         ("[[ramp]]\nlength = 1\nslope_deg = 'a'", "ramp 1: slope_deg = 'a': must be a number of degrees"),
         ("[ramp]\nlength = 1", "ramp = {'length': 1}: must be a list of tables [[ramp]]"),
         ("ramp = 3", "ramp = 3: must be a list of tables [[ramp]]"),
@@ -227,7 +347,7 @@ def test_the_table_of_a_list_that_is_wrong_is_numbered(ramp_file, text, message)
     ("table", "message"),
     [
         ({"length": 1}, "missing slope"),
-        ({"length": 1, "slope": 0, "width": 2}, "unknown key 'width'; allowed: length, slope, marks"),
+        ({"length": 1, "slope": 0, "width": 2}, "unknown key 'width'; allowed: length, slope, slope_deg, marks"),
         ({"length": -1, "slope": 0}, "length = -1: must be a length in metres, above 0 and at most 100"),
     ],
 )

@@ -167,6 +167,20 @@ def test_the_beginning_of_a_phase_is_marked_once():
         assert sum(list(line.get_xdata()) == [2, 2] for line in ax.lines) == 1
 
 
+MISTYPED = ["a", True, None, [1], {"overall": "a"}, {"overall": [1]}, {"overall": {}}, 10**19]
+
+
+@pytest.mark.parametrize("value", MISTYPED)
+def test_what_is_no_number_is_not_drawn(tmp_path, value):
+    keys = ("phase", "loss", "validation_loss", "learning_rate", "average_precision", "f1")
+    rows = [{"step": 1, "loss": 0.5, "phase": 1}, *({"step": 2, key: value} for key in keys), {"step": 3, "loss": 0.25}]
+    figure = curves.training_figure(rows)
+    pixels(figure, tmp_path)
+    steps, losses = labelled_lines(figure.axes[0])["training"]
+    assert [steps[0], losses[0], steps[-1], losses[-1]] == [1, 0.5, 3, 0.25]
+    assert len(steps) == (3 if value == 10**19 else 2)
+
+
 @pytest.mark.parametrize("rows", [[], [{"step": 5}], [{"step": 1, "loss": 0.5}], [{"step": 1, "f1": {}}]])
 def test_rows_may_lack_anything(tmp_path, rows):
     figure = curves.training_figure(rows)

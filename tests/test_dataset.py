@@ -492,7 +492,10 @@ DAMAGES = {
         lambda folder: os.truncate(folder / "dataset.json", 300),
         "{0}/dataset.json: not JSON: ",
     ),
-    "no text": (lambda folder: (folder / "dataset.json").write_bytes(b"\xff\xfe{}"), "{0}/dataset.json: not JSON: "),
+    "no text": (
+        lambda folder: (folder / "dataset.json").write_bytes(b"\xff\xfe{}"),
+        "{0}/dataset.json: cannot be read: byte 0 is not",
+    ),
     "a list": (
         lambda folder: (folder / "dataset.json").write_text("[]"),
         "{0}/dataset.json: not the description of a travjax data set",
@@ -558,7 +561,7 @@ DAMAGES = {
     ),
     "objects": (
         lambda folder: changed_array(folder, "group", np.array([{}] * 6, object)),
-        "{0}: Object arrays cannot be loaded",
+        "{0}/group.npy: cannot be read as an array: Object arrays cannot be loaded",
     ),
 }
 

@@ -83,6 +83,21 @@ def test_the_paper_stands_beside_its_own_robot_and_actions_on_synthetic_maps_onl
     assert replace(evaluator, run=papers, dataset=replace(dataset(), config=None)).paper is None
 
 
+def test_a_figure_takes_no_longer_than_the_evaluation(evaluator):
+    """18 trajectories a map, 3 radii; every third or sixth would leave out arcs."""
+    assert [evaluator.every(2, samples) for samples in (100, 36, 35, 18, 9, 8, 1)] == [1, 1, 2, 2, 4, 5, 5]
+    papers = replace(evaluator, run=replace(run_of(), actions=ActionSpace()))
+    assert [papers.every(2, samples) for samples in (400, 3042, 6083, 6084)] == [6, 2, 2, 1]
+    some = ActionSpace().split(np.arange(0, 3042, 6))
+    assert [len(np.unique(part)) for part in some] == [18, 13, 13]
+
+
+def test_every_so_many_trajectories_are_those_of_all(evaluator):
+    maps, network = evaluator.to_show(2), estimator()
+    some = evaluator.whole_maps(network, maps, every=5)
+    np.testing.assert_allclose(some, evaluator.whole_maps(network, maps)[:, ::5], rtol=0, atol=1e-6)
+
+
 def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
     monkeypatch.setattr(
         "travjax.parallel.Devices.check_batch", lambda self, size: require(size == 9, "batch_size", size, "9")
@@ -92,7 +107,7 @@ def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "other", [{"robot": replace(HUSKY, track=0.5)}, {"actions": replace(FEW, turns=3)}, {"grid": replace(GRID, size=5)}]
+    "other", [{"robot": replace(HUSKY, track=0.6)}, {"actions": replace(FEW, turns=3)}, {"grid": replace(GRID, size=5)}]
 )
 def test_a_data_set_of_something_else_is_refused(other):
     with pytest.raises(InputError, match=f"^{next(iter(other))} of the data set: ") as raised:

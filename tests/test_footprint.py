@@ -317,7 +317,7 @@ def test_a_map_that_is_left_to_any_side_is_refused(turns):
 def test_a_robot_wider_than_the_map_is_refused():
     actions = ActionSpace(turns=1, radii=(math.inf,), arc_lengths=(0.1, 0.1))
     with pytest.raises(InputError, match="^arc_lengths = .*: trajectories leave the 1 m map by 0.125 m"):
-        node_table(replace(SEEKUR_JR, chassis_width=1.3, chassis_length=0.2), actions, Grid(1, 0.125))
+        node_table(replace(SEEKUR_JR, track=1.5, chassis_width=1.3, chassis_length=0.2), actions, Grid(1, 0.125))
 
 
 def test_a_chassis_that_falls_between_the_nodes_is_refused_with_a_spacing_that_works():

@@ -39,15 +39,17 @@ def test_equal_grids_are_one_key():
     assert Grid(8, 0.125) != Grid()
 
 
-@pytest.mark.parametrize("size", [0, -8, 1001, math.nan, math.inf, "8", None, True])
+@pytest.mark.parametrize("size", [0, 1e-40, -8, 1001, math.nan, math.inf, "8", None, True])
 def test_a_bad_size_is_refused(size):
-    with pytest.raises(InputError, match="^size = .*: must be an edge length in metres, at most 1000$"):
+    with pytest.raises(InputError, match="^size = .*: must be a length in metres from 0.001 to 1000$"):
         Grid(size, 0.0625)
 
 
-@pytest.mark.parametrize("spacing", [0, -0.1, 8.5, math.nan, math.inf, "0.1", None, True])
+@pytest.mark.parametrize("spacing", [0, 1e-40, 0.00099, -0.1, 8.5, math.nan, math.inf, "0.1", None, True])
 def test_a_bad_spacing_is_refused(spacing):
-    with pytest.raises(InputError, match="^spacing = .*: must be a distance in metres, above 0 and at most the map's"):
+    with pytest.raises(
+        InputError, match="^spacing = .*: must be a distance in metres, from 0.001 and at most the map's"
+    ):
         Grid(8, spacing)
 
 
@@ -58,6 +60,6 @@ def test_a_spacing_that_does_not_divide_the_size_is_refused(spacing):
 
 
 def test_a_grid_of_too_many_cells_is_refused():
-    assert Grid(1, 1 / 4096).cells == 4096
+    assert Grid(8, 8 / 4096).cells == 4096
     with pytest.raises(InputError, match="^spacing = .*: must be such that an edge has at most 4096 cells$"):
-        Grid(1, 1 / 4097)
+        Grid(8, 8 / 4097)

@@ -30,7 +30,7 @@ STEP = 2.5e-4
 SMALL = Setting(HUSKY, ActionSpace(turns=4, radii=(math.inf, 0.7, -0.7), arc_lengths=(0.6, 0.5)), Grid(4, 0.125))
 """36 trajectories on maps of 33 x 33 nodes."""
 
-ON_NODES = replace(SEEKUR_JR, track=10 * CELL, wheelbase=6 * CELL, wheel_width=3 * CELL)
+ON_NODES = replace(SEEKUR_JR, track=10 * CELL, wheelbase=6 * CELL, wheel_width=3 * CELL, chassis_width=7 * CELL)
 """Its wheels pass over nodes when it drives straight on."""
 
 CLOSE_TO_HALF_THE_TRACK = (SEEKUR_JR.track / 2, -SEEKUR_JR.track / 2, SEEKUR_JR.track / 2 + 1e-3)
@@ -44,7 +44,9 @@ TURNING_SETTINGS = {
     ),
     "half the track": Setting(SEEKUR_JR, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
     "wheels on the spot": Setting(SHORT, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
-    "wide wheels": Setting(replace(HUSKY, wheel_width=0.7), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)),
+    "wide wheels": Setting(
+        replace(HUSKY, wheel_width=0.7, ride_height=0.4), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)
+    ),
     "thin wheels": Setting(replace(HUSKY, wheel_width=0.01), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)),
     "an odd number of cells": Setting(HUSKY, ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1), Grid(7.8, 0.2)),
 }
@@ -198,7 +200,8 @@ lengths = st.floats(0.2, 2.5)
 )
 def test_any_robot_and_arcs_are_as_rendered(track, wheelbase, wheel_width, arc_lengths, tightness, turn, arcs):
     radius = tightness * track / 2
-    robot = replace(SEEKUR_JR, track=track, wheelbase=wheelbase, wheel_width=wheel_width)
+    above = {"ride_height": 1.0}  # so that wheels of any track stand below the chassis
+    robot = replace(SEEKUR_JR, track=track, wheelbase=wheelbase, wheel_width=wheel_width, **above)
     actions = ActionSpace(turns=7, radii=(math.inf, radius, -radius), arc_lengths=arc_lengths, interval=0.1)
     setting, sample = Setting(robot, actions, Grid(8, 0.125)), [actions.index(turn, *arcs)]
     assert_rendered(channels(setting, sample), setting, sample)
@@ -370,7 +373,7 @@ def test_a_missing_cache_folder_is_made(tmp_path, bank):
 @pytest.mark.parametrize(
     "other",
     [
-        SMALL._replace(robot=replace(HUSKY, wheel_width=0.2)),
+        SMALL._replace(robot=replace(HUSKY, wheel_width=0.13)),
         SMALL._replace(robot=replace(HUSKY, track=0.6)),
         SMALL._replace(robot=replace(HUSKY, wheelbase=0.6)),
         SMALL._replace(actions=replace(SMALL.actions, radii=(math.inf, -0.7, 0.7))),
@@ -423,7 +426,7 @@ def test_a_damaged_bank_is_made_anew(tmp_path, bank, damaged):
 
 
 def test_a_bank_of_another_configuration_under_its_name_is_made_anew(tmp_path, bank):
-    other = SMALL._replace(robot=replace(HUSKY, wheel_width=0.2))
+    other = SMALL._replace(robot=replace(HUSKY, wheel_width=0.13))
     trajectory_bank(*SMALL, cache=tmp_path / "own")
     trajectory_bank(*other, cache=tmp_path / "other")
     file = only_file(tmp_path / "own")

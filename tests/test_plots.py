@@ -69,11 +69,36 @@ def test_a_saved_figure_is_a_png_and_nothing_else_is_left(tmp_path):
 
 
 def test_a_figure_that_cannot_be_drawn_leaves_no_file(tmp_path):
-    figure = Figure()
-    figure.suptitle("$\\nosuchcommand{$")
-    with pytest.raises(ValueError, match="nosuchcommand"):
-        plots.save(figure, tmp_path / "bad.png")
+    class Half(Figure):
+        def savefig(self, path, **options):
+            path.write_text("half")
+            raise ValueError("no such font")
+
+    with pytest.raises(ValueError, match="no such font"):
+        plots.save(Half(), tmp_path / "bad.png")
     assert list(tmp_path.iterdir()) == []
+
+
+NAMES = ["a$\\frac$b", "$x^2$ and $y$", "R $_{$", "line\x07end", "\U0001f600 \u0b95", "\udcff.tif", "50 % \\alpha"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_are_drawn_as_they_are(tmp_path, recwarn, name):
+    figure = Figure(layout="constrained")
+    ax = figure.subplots()
+    ax.plot([1, 1000], [1, 2], label=name)
+    ax.set(xscale="log", title=f"{name}\nsecond line", xlabel=name)
+    ax.annotate(name, (1, 1))
+    ax.legend()
+    figure.suptitle(name)
+    plots.save(figure, tmp_path / "names.png")
+    shown = name.encode("unicode_escape").decode() if not name.isprintable() else name
+    texts = (ax.xaxis.label, figure._suptitle, ax.texts[0], ax.get_legend().get_texts()[0])
+    assert [text.get_text() for text in texts] == [shown] * 4
+    assert ax.get_title() == f"{shown}\nsecond line"
+    assert not any(text.get_parse_math() for text in (*texts, ax.title))
+    assert ax.get_xticklabels()[1].get_parse_math()  # powers of ten are set as mathematics
+    assert not recwarn.list
 
 
 # ---- Contact sheets
@@ -310,6 +335,18 @@ def test_several_predictions_stand_below_each_other_and_the_truth_is_last(tmp_pa
         {"failed": 36},
     ]
     assert sorted(shown, key=lambda ax: -ax.get_window_extent().y0) == shown
+
+
+def test_every_so_many_trajectories_are_said_to_be_that():
+    shown, known = np.zeros((1, 8, 3)), np.ones((1, 8), bool)
+    heights = np.zeros((1, *GRID.shape), np.float32)
+    settings = (["one"], SEEKUR_JR, FEW, GRID)
+    figure = plots.predicted_maps(heights, {"predicted": shown}, shown > 1, known, *settings, "simulator", every=5)
+    assert figure.get_suptitle() == "8 of the 36 trajectories of Seekur Jr"
+    above, below = (ax for ax in figure.axes if ax.get_title().startswith("step, "))
+    assert below.get_title() == "step, simulator: 0.0% of known fail"
+    lines = next(lines for lines in above.collections if len(lines.get_segments()))
+    np.testing.assert_allclose(lines.get_segments(), FEW.poses(np.arange(0, 36, 5))[..., :2], rtol=0, atol=1e-12)
 
 
 def test_the_trajectory_that_is_predicted_to_fail_turns_red():

@@ -73,6 +73,12 @@ def test_a_file_gives_what_was_written(tmp_path, tiny):
     np.testing.assert_array_equal(predict(heights, str(tmp_path / "tiny.safetensors")), wanted)
 
 
+def test_it_is_shown_in_a_few_lines(tiny):
+    text = repr(tiny)
+    assert len(text) < 200 and len(text.splitlines()) == 2
+    assert text.startswith(f"Predictor({RUN.preset.model} for {RUN.robot.name},") and f"{len(RUN.actions)} traj" in text
+
+
 def test_what_is_no_estimator_is_refused(tmp_path):
     (tmp_path / "x.npz").touch()
     allowed = "no estimator; allowed: the folder of a training run, or a .safetensors file"

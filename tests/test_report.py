@@ -9,6 +9,7 @@ from travjax.metrics import PAPER_REAL, evaluate
 from travjax.report import (
     PAPER_SHARES,
     baselines_table,
+    calibration_line,
     groups_table,
     metrics_table,
     rows_table,
@@ -206,6 +207,41 @@ def test_thresholds_are_those_worked_out_by_hand():
     assert rows["tilt", "0.989"][-1] == "0.474"
     assert rows["overall", "0.944"][-1] == "0.684"
     assert notes(table) == ["tilt: no sample fails, so the figures with a dash are undefined"]
+
+
+@pytest.mark.parametrize(
+    ("probability", "failures", "wanted"),
+    [
+        (0.5, 5, "right on average, 1.00 times the frequency"),
+        (0.54, 5, "right on average, 1.08 times the frequency"),
+        (0.6, 5, "too high on average, 1.20 times the frequency"),
+        (0.4, 5, "too low on average, 0.80 times the frequency"),
+        (0.4, 0, "too high on average, no sample fails"),
+    ],
+)
+def test_calibration_says_what_was_measured(probability, failures, wanted):
+    failed = np.zeros((10, 3), bool)
+    failed[:failures] = True
+    line = calibration_line(evaluate(np.full((10, 3), probability), failed, paper=None))
+    assert f"step {probability:.4f} ({failures / 10:.4f}), obstacle " in line
+    assert f"Overall the probabilities are {wanted}; reliability.png" in line and "\n" not in line
+
+
+def test_calibration_of_each_event_is_its_own():
+    probabilities, failed = np.tile([0.1, 0.2, 0.3], (10, 1)), np.zeros((10, 3), bool)
+    failed[:2, OBSTACLE], failed[:1, TILT] = True, True
+    line = calibration_line(evaluate(probabilities, failed, paper=None))
+    assert "step 0.1000 (0.0000), obstacle 0.2000 (0.2000), tilt 0.3000 (0.1000), overall 0.2000 (0.1000). " in line
+
+
+def test_a_name_is_one_line_of_a_table():
+    failed, known = ten_trajectories(2)
+    names = ["a\nb\x1b[31m", "\udcff" + "n" * 5000]
+    lines = shares_table(names, failed, known, as_in_paper=False).splitlines()
+    assert len(lines) == 5 and lines[2].startswith("a\\nb\\x1b[31m ")
+    assert lines[3].startswith("\\udcffnn") and len(lines[3]) < 200
+    lines.append(groups_table(evaluate(np.zeros((2, 3)), failed[:, 0], names, paper=None)))
+    assert "\n".join(lines).replace("\n", " ").isprintable()
 
 
 def test_groups_are_those_worked_out_by_hand():

@@ -95,20 +95,23 @@ def test_a_file_without_a_field_is_refused_by_name(tmp_path, field):
 def test_a_wrong_value_in_a_file_is_named_with_the_file(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(as_toml(track=-1))
-    with pytest.raises(InputError, match="mine.toml: track = -1: must be a length in metres, above 0 and at most 100$"):
+    with pytest.raises(InputError, match="mine.toml: track = -1: must be a length in metres from 0.001 to 100$"):
         Robot.load(path)
 
 
 @pytest.mark.parametrize("field", LENGTHS)
-@pytest.mark.parametrize("value", [0, -0.1, 100.1, math.nan, math.inf, "0.4", None, True])
+@pytest.mark.parametrize(
+    "value",
+    [0, 1e-40, 0.00099, -0.1, 100.1, pytest.param(10**5000, id="digits"), math.nan, math.inf, "0.4", None, True],
+)
 def test_a_bad_length_is_refused(field, value):
-    with pytest.raises(InputError, match=f"^{field} = .*: must be a length in metres, above 0 and at most 100$"):
+    with pytest.raises(InputError, match=f"^{field} = .*: must be a length in metres from 0.001 to 100$"):
         replace(SEEKUR_JR, **{field: value})
 
 
-@pytest.mark.parametrize("value", [0, -0.1, 36.87, math.nan, math.inf, "0.4", None, True])
+@pytest.mark.parametrize("value", [0, 1e-40, -0.1, 36.87, math.nan, math.inf, "0.4", None, True])
 def test_a_bad_tilt_is_refused(value):
-    with pytest.raises(InputError, match="^max_tilt = .*: must be an angle above 0 and at most 90 degrees"):
+    with pytest.raises(InputError, match="^max_tilt = .*: must be an angle from 0.01 to 90 degrees"):
         replace(SEEKUR_JR, max_tilt=value)
 
 
@@ -116,10 +119,37 @@ def test_a_right_angle_is_the_largest_tilt():
     assert replace(SEEKUR_JR, max_tilt=math.pi / 2).max_tilt == math.pi / 2
 
 
-@pytest.mark.parametrize("name", ["", None, 3, ["Seekur"]])
+def test_a_millimetre_is_a_length():
+    small = dict.fromkeys(LENGTHS, 0.001) | {"track": 0.002}
+    assert replace(SEEKUR_JR, **small).wheelbase == 0.001
+    assert replace(SEEKUR_JR, max_tilt=math.radians(0.01)).max_tilt == math.radians(0.01)
+
+
+@pytest.mark.parametrize("name", ["", None, 3, ["Seekur"], "Seekur\nJr", "\x1b[31mSeekur", "n" * 101, "\udcff"])
 def test_a_bad_name_is_refused(name):
-    with pytest.raises(InputError, match="^name = .*: must be a non-empty text$"):
+    with pytest.raises(InputError, match="^name = .*: must be a non-empty text of one line, at most 100 characters$"):
         replace(SEEKUR_JR, name=name)
+
+
+def test_wheels_inside_the_chassis_are_refused_with_all_numbers():
+    allowed = "at least chassis_width \\+ wheel_width = 0.44 \\+ 0.172 = 0.612 m, or the wheels are inside the chassis"
+    with pytest.raises(InputError, match=f"^track = 0.611: must be {allowed}$"):
+        replace(SEEKUR_JR, track=0.611)
+    assert replace(SEEKUR_JR, track=0.612).track == 0.612
+
+
+@pytest.mark.parametrize(
+    "outside", [{"ride_height": 0.4}, {"chassis_length": 0.2, "wheelbase": 0.61}], ids=["below", "before and behind"]
+)
+def test_wheels_below_or_beyond_the_chassis_may_stand_close(outside):
+    assert replace(SEEKUR_JR, track=0.3, **outside).track == 0.3
+
+
+def test_a_limit_of_roll_is_told_the_limit_of_tilt(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(as_toml(max_tilt=None) + "\nmax_roll_deg = 30")
+    with pytest.raises(InputError, match="unknown key 'max_roll_deg'; allowed: .*; perhaps max_tilt_deg is meant$"):
+        Robot.load(path)
 
 
 def test_limits_are_step_obstacle_tilt():
@@ -128,8 +158,8 @@ def test_limits_are_step_obstacle_tilt():
 
 
 def test_wheels_stand_front_left_front_right_rear_left_rear_right():
-    robot = replace(SEEKUR_JR, track=0.6, wheelbase=0.4)
-    expected = [(-0.3, 0.2), (0.3, 0.2), (-0.3, -0.2), (0.3, -0.2)]
+    robot = replace(SEEKUR_JR, track=0.64, wheelbase=0.4)
+    expected = [(-0.32, 0.2), (0.32, 0.2), (-0.32, -0.2), (0.32, -0.2)]
     np.testing.assert_allclose(robot.wheel_positions(), expected, rtol=0, atol=1e-15)
 
 

@@ -88,14 +88,48 @@ def test_no_file_has_no_rows(tmp_path):
     assert read_rows(tmp_path / "metrics.jsonl") == [ROWS[2]]
 
 
-def test_a_damaged_line_is_named(tmp_path):
+DAMAGES = {
+    "a flipped bit": lambda line: line[:5] + bytes([line[5] | 0x80]) + line[6:],
+    "no JSON": lambda line: line.replace(b'"step": 2', b'"step: 2'),
+    "a text as step": lambda line: line.replace(b'"step": 2', b'"step": "2"'),
+    "a negative step": lambda line: line.replace(b'"step": 2', b'"step": -2'),
+    "no step": lambda line: line.replace(b'"step"', b'"stop"'),
+    "no row": lambda line: b"3",
+    "nothing": lambda line: b"",
+    "not finite": lambda line: line.replace(b"0.5", b"NaN"),
+    "beyond a number": lambda line: line.replace(b"0.5", b"1e999"),
+    "too deep": lambda line: b"[" * 5000,
+    "too many digits": lambda line: b'{"step": ' + b"9" * 5000 + b"}",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_line_is_named_and_left_out(tmp_path, capsys, damage):
     written(tmp_path)
     path = tmp_path / "metrics.jsonl"
-    path.write_text(path.read_text().replace('"step": 2', '"step: 2'))
-    for call in (lambda: read_rows(path), lambda: RunLog(tmp_path, 2)):
-        with pytest.raises(InputError) as raised:
-            call()
-        assert str(raised.value) == f"{path}: line 2: not a row with its step"
+    lines = path.read_bytes().splitlines()
+    lines[1] = DAMAGES[damage](lines[1])
+    path.write_bytes(b"".join(line + b"\n" for line in lines))
+    said = f"{path}: line 2 left out: must be a row of JSON with its step\n"
+    assert read_rows(path) == [ROWS[0], ROWS[2]]
+    assert capsys.readouterr().out == said
+    written(tmp_path, [ROWS[2] | {"loss": 7.0}], step=2)
+    assert capsys.readouterr().out == said
+    assert read_rows(path) == [ROWS[0], ROWS[2] | {"loss": 7.0}]
+    assert capsys.readouterr().out == ""
+
+
+def test_several_damaged_lines_are_one_line(tmp_path, capsys):
+    path = tmp_path / "metrics.jsonl"
+    path.write_bytes(b'{"step": 1}\n\xff\n{"step": 2}\n\xff\n\n{"step": 3}\n')
+    assert [row["step"] for row in read_rows(path)] == [1, 2, 3]
+    assert capsys.readouterr().out == f"{path}: 3 lines from 2 on left out: must be a row of JSON with its step\n"
+
+
+def test_a_log_that_cannot_be_read_is_one_line(tmp_path):
+    (tmp_path / "metrics.jsonl").mkdir()
+    with pytest.raises(InputError, match="metrics.jsonl: cannot be read: Is a directory$"):
+        read_rows(tmp_path / "metrics.jsonl")
 
 
 def test_what_cannot_be_written_is_one_line(tmp_path):

@@ -116,6 +116,32 @@ def one_of(params: TerrainParams, index: int) -> TerrainParams:
     return TerrainParams(*(np.asarray(getattr(params, field))[index] for field in FIELDS))
 
 
+def test_maps_of_one_world_are_the_same_where_they_overlap():
+    params, noise_seeds = sample_params(STYLES, range(5))
+    small = np.asarray(generate_terrain(STYLES, range(5)))
+    large = np.asarray(generate_terrain(STYLES, range(5), grid=Grid(16), world=8))
+    np.testing.assert_array_equal(large[:, 64:193, 64:193], small)
+    again = elevation(params, noise_seeds, grid=Grid(16), world=8.0)
+    np.testing.assert_array_equal(again, large)
+    grown = np.asarray(generate_terrain(STYLES, range(5), grid=Grid(16)))
+    np.testing.assert_array_equal(generate_terrain(STYLES, range(5), grid=Grid(16), world=16), grown)
+    assert not np.array_equal(grown[:, 64:193, 64:193], small)
+
+
+def test_a_larger_map_of_the_same_world_is_algorithm_1_with_its_size():
+    params, noise_seeds = sample_params("rough", 3)
+    heights = np.asarray(generate_terrain("rough", 3, grid=Grid(12, 0.125), world=8))[0]
+    axis = Grid(12, 0.125).axis()[::8]
+    expected = algorithm_1(one_of(params, 0), noise_seeds[0], axis, axis, 8)
+    np.testing.assert_allclose(heights[::8, ::8], expected, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("world", [0, 0.99, 1001, -8, np.nan, np.inf, "8", True])
+def test_a_bad_world_is_refused(world):
+    with pytest.raises(InputError, match="^world = .*: must be a map size in metres from 1 to 1000$"):
+        generate_terrain("rough", 0, world=world)
+
+
 def assert_is_algorithm_1(heights, params: TerrainParams, noise_seed, grid=Grid(), every=1, offset=0):
     """Compares every so many rows and columns of one map."""
     axis = grid.axis()[offset::every]

@@ -564,7 +564,7 @@ def test_a_data_set_of_another_robot_or_action_space_is_refused(tmp_path):
     other = replace(run_of(), actions=ActionSpace(turns=2, arc_lengths=(0.5, 0.7), radii=FEW.radii, interval=0.1))
     message = refusal(Trainer, other, dataset(), tmp_path, None)
     assert message == ("actions of the data set: arc_lengths = (0.5, 0.6); must be as here: arc_lengths = (0.5, 0.7)")
-    other = replace(run_of(), robot=replace(HUSKY, track=0.5))
+    other = replace(run_of(), robot=replace(HUSKY, track=0.6))
     assert refusal(Trainer, other, dataset(), tmp_path, None).startswith("robot of the data set: track = ")
 
 

@@ -85,7 +85,7 @@ def test_what_does_not_matter_to_a_run_that_has_begun_may_differ():
     [
         (run_of(learning_rate=2e-3), "preset.training.learning_rate", ("0.002", "0.001")),
         (replace(run_of(), preset=replace(PRESET, elevation_scale=2.0)), "preset.elevation_scale", ("2.0", "0.5")),
-        (replace(run_of(), robot=replace(HUSKY, track=0.5)), "robot.track", ("0.5", repr(HUSKY.track))),
+        (replace(run_of(), robot=replace(HUSKY, track=0.6)), "robot.track", ("0.6", repr(HUSKY.track))),
         (replace(run_of(), actions=replace(FEW, turns=3)), "actions.turns", ("3", "2")),
     ],
 )

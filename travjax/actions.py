@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from travjax.config import load_toml, require, require_number
+from travjax.config import load_toml, require, require_length, require_number
 
 ARC_LENGTH = 1.65
 
@@ -47,22 +47,17 @@ class ActionSpace:
         pair = isinstance(self.arc_lengths, tuple) and len(self.arc_lengths) == 2
         require(pair, "arc_lengths", self.arc_lengths, "two lengths in metres")
         for length in self.arc_lengths:
-            require_number("arc_lengths", length, 0, 1000, "lengths in metres, above 0 and at most 1000")
+            require_length("arc_lengths", length, 0.001, 1000)
         radii = isinstance(self.radii, tuple) and len(self.radii) > 0
         require(radii, "radii", self.radii, "a list of one or more radii in metres")
         for radius in self.radii:
             number = isinstance(radius, Real) and not isinstance(radius, bool)
-            require(
-                number and radius != 0 and radius > -math.inf,
-                "radii",
-                radius,
-                "a radius in metres, not 0; inf is straight",
-            )
+            fits = number and (radius == math.inf or 0.001 <= abs(radius) <= 1e12)
+            require(fits, "radii", radius, "a radius in metres from 0.001 to 1e12, + or -; inf is straight")
         require(len(set(self.radii)) == len(self.radii), "radii", self.radii, "different from each other")
         require(len(self) <= 1_000_000, "turns x radii x radii", len(self), "at most 1000000 trajectories")
-        require_number(
-            "interval", self.interval, 0, min(self.arc_lengths), "a length in metres, at most an arc's length"
-        )
+        allowed = "a length in metres, from 0.001 and at most an arc's length"
+        require_number("interval", self.interval, math.nextafter(0.001, 0), min(self.arc_lengths), allowed)
         shortest = max(self.arc_lengths) / 1000
         require(
             self.interval >= shortest, "interval", self.interval, f"at least a thousandth of an arc, {shortest:g} m"

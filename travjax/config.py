@@ -1,4 +1,4 @@
-"""What every configuration shares: one-line errors and checked TOML files.
+"""What every configuration shares: one-line errors, and TOML and JSON files that are checked when they are read.
 
 A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
 may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is. A field with the
@@ -6,9 +6,12 @@ metadata `items` is a tuple of configurations of that kind, in the file a list o
 """
 
 import dataclasses
+import difflib
+import json
 import math
-import textwrap
+import re
 import tomllib
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,17 +19,49 @@ import numpy as np
 
 Config = TypeVar("Config")
 
+LONGEST = 600
+"""Characters of a message, and of a name that is printed; the middle of a longer one is left out."""
+
+QUOTED = 80
+"""Characters of a value in a message."""
+
+LARGEST = 64 << 20
+"""Bytes of a text file of ours."""
+
+DEEPEST = 50
+"""Lists and tables within each other in a text file of ours, which has four at most."""
+
 
 class InputError(ValueError):
     """Bad input in one line: which file or argument, which field, which value, and what is allowed."""
+
+    def __init__(self, message: object):
+        super().__init__(one_line(message))
+
+
+def one_line(text: object, most: int = LONGEST) -> str:
+    """Returns a text as it is printed: line breaks and all else that is not printable escaped, and not too long."""
+    whole = str(text)
+    plain = whole if whole.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in whole)
+    end = most // 3
+    return plain if len(plain) <= most else f"{plain[: most - end - 5]} ... {plain[-end:]}"
+
+
+def shown(value: object) -> str:
+    """Returns a value as messages quote it: its repr in one line, cut off where it is long."""
+    plain = value.item() if isinstance(value, np.generic) else value
+    try:
+        text = repr(plain)
+    except (ValueError, RecursionError):  # a whole number of thousands of digits, lists within lists
+        text = hex(plain) if isinstance(plain, int) else f"a {type(plain).__name__}"
+    text = " ".join(text.split())
+    return text if len(text) <= QUOTED else f"{text[: QUOTED - 4]} ..."
 
 
 def require(condition: bool, field: str, value: object, allowed: str) -> None:
     """Raises InputError "field = value: must be allowed" unless the condition holds."""
     if not condition:
-        plain = value.item() if isinstance(value, np.generic) else value
-        shown = textwrap.shorten(repr(plain), 80, placeholder=" ...")
-        raise InputError(f"{field} = {shown}: must be {allowed}")
+        raise InputError(f"{field} = {shown(value)}: must be {allowed}")
 
 
 def require_number(field: str, value: object, low: float, high: float, allowed: str) -> None:
@@ -39,6 +74,11 @@ def require_number(field: str, value: object, low: float, high: float, allowed: 
     require(math.isfinite(number) and low < number <= high, field, value, allowed)
 
 
+def require_length(field: str, value: object, low: float, high: float) -> None:
+    """Raises InputError unless `value` is a number of metres from `low` to `high`."""
+    require_number(field, value, math.nextafter(low, 0), high, f"a length in metres from {low:g} to {high:g}")
+
+
 def load_toml(path: str | Path, kind: type[Config]) -> Config:
     """Reads one configuration dataclass from a TOML file.
 
@@ -46,17 +86,85 @@ def load_toml(path: str | Path, kind: type[Config]) -> Config:
     default is absent, and when the dataclass refuses a value.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            table = tomllib.load(file)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not a TOML file: {error}") from None
+    table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
     try:
         return kind(**_fields_from(table, kind))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def read_json(path: Path, allowed: str = "", finite: bool = True) -> Any:
+    """Reads a JSON file of ours; what is wrong with it is an InputError that names it, as `read_text` says."""
+    return parse_json(read_text(path, allowed), path, finite)
+
+
+def parse_json(text: str, where: object, finite: bool = True) -> Any:
+    """Returns what a JSON text holds.
+
+    Raises InputError that begins with `where` when it is not JSON, is nested too deep, or holds a whole number beyond
+    64 bits or, with `finite`, a number that is not finite.
+    """
+    return _parsed(where, text, json.loads, "JSON", finite)
+
+
+def read_text(path: Path, allowed: str = "") -> str:
+    """Reads a text file of ours.
+
+    Raises InputError that names it when it is missing, in which case it also says what is allowed, too large or not
+    UTF-8.
+    """
+    data = bytearray()
+    try:
+        with path.open("rb") as file:
+            while len(data) <= LARGEST and (piece := file.read(1 << 20)):
+                data += piece
+    except (OSError, ValueError) as error:  # ValueError: a name with a NUL byte
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be read: {reason}{allowed and f'; allowed: {allowed}'}") from None
+    if len(data) > LARGEST:
+        raise InputError(f"{path}: cannot be read: must be a text of at most {LARGEST >> 20} MiB")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: cannot be read: byte {error.start} is not UTF-8") from None
+
+
+def _parsed(where: object, text: str, parse: Callable[[str], Any], kind: str, finite: bool) -> Any:
+    """What a parser makes of a text, once it is known to hold nothing that no file of ours holds."""
+    try:
+        found = parse(text)
+    except RecursionError:
+        raise InputError(f"{where}: lists and tables: must be nested {DEEPEST} deep at most") from None
+    except Exception as error:  # the parser's own, and what Python says of a number of thousands of digits
+        if number := re.search(r"\d[\d_]{999,}", text):
+            line, digits = text.count("\n", 0, number.start()) + 1, f"{number[0][:20]} ..."
+            raise InputError(f"{where}: line {line}: {digits}: must be a number of fewer digits") from None
+        raise InputError(f"{where}: not {kind}: {error}") from None
+    try:
+        _require_plain(found, finite)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    return found
+
+
+def _require_plain(found: object, finite: bool) -> None:
+    """Refuses whole numbers beyond 64 bits, deep nesting, and with `finite` numbers that are not, by name."""
+    level: list[tuple[str, object]] = [("", found)]
+    for _ in range(DEEPEST):
+        inner: list[tuple[str, object]] = []
+        for name, value in level:
+            if isinstance(value, dict):
+                inner += [(f"{name}.{key}" if name else key, item) for key, item in value.items()]
+            elif isinstance(value, list):
+                inner += [(f"{name}[{index}]", item) for index, item in enumerate(value)]
+            elif type(value) is int:
+                require(-(2**63) <= value < 2**64, name, value, "a whole number of 64 bits")
+            elif finite and isinstance(value, float):
+                require(math.isfinite(value), name, value, "a finite number")
+        if not inner:
+            return
+        level = inner
+    require(False, level[0][0].partition("[")[0], "...", f"nested {DEEPEST} deep at most")
 
 
 def to_json(config: object) -> dict[str, Any]:
@@ -73,12 +181,21 @@ def to_json(config: object) -> dict[str, Any]:
     return {field.name: plain(getattr(config, field.name)) for field in dataclasses.fields(config)}  # type: ignore[arg-type]
 
 
-def from_json(table: dict[str, Any], kind: type[Config]) -> Config:
+def from_json(table: Any, kind: type[Config]) -> Config:
     """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
+    require(isinstance(table, dict), kind.__name__, table, "a table")
     infinite = {"inf": math.inf, "-inf": -math.inf}
     number = lambda item: infinite.get(item, item) if isinstance(item, str) else item
     lists = {key: [number(item) for item in value] for key, value in table.items() if type(value) is list}
     return kind(**_fields_from(table | lists, kind))  # tables within a table hold no infinite numbers
+
+
+def parts_from_json(table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Returns the configurations that a table has under names; raises InputError that says what is missing or wrong."""
+    missing = [name for name in kinds if not isinstance(table, dict) or name not in table]
+    if missing:
+        raise InputError(f"missing {', '.join(missing)}")
+    return {name: from_json(table[name], kind) for name, kind in kinds.items()}
 
 
 def _fields_from(table: dict, kind: type) -> dict:
@@ -88,9 +205,9 @@ def _fields_from(table: dict, kind: type) -> dict:
         name = key.removesuffix("_deg")
         degrees = key != name
         if name not in names or degrees and not names[name].metadata.get("angle"):
-            raise InputError(f"unknown key {key!r}; allowed: {', '.join(names)}")
+            raise InputError(_unknown(key, names))
         if name in values:
-            raise InputError(f"{key} = {value!r}: is given twice, once in degrees; allowed: once")
+            raise InputError(f"{key} = {shown(value)}: is given twice, once in degrees; allowed: once")
         if degrees:
             require_number(key, value, -math.inf, math.inf, "a number of degrees")
             value = math.radians(value)
@@ -105,6 +222,15 @@ def _fields_from(table: dict, kind: type) -> dict:
     if missing:
         raise InputError(f"missing {', '.join(missing)}")
     return values
+
+
+def _unknown(key: str, names: dict[str, dataclasses.Field]) -> str:
+    """What is wrong with a key that is no field: the field it may be meant for, and all fields as they are written."""
+    written = [(name, f"{name}_deg") if field.metadata.get("angle") else (name,) for name, field in names.items()]
+    allowed = [form for forms in written for form in forms]
+    near = difflib.get_close_matches(key, allowed, n=1)
+    meant = f"; perhaps {near[0]} is meant" if near else ""
+    return f"unknown key {shown(key)}; allowed: {', '.join(allowed)}{meant}"
 
 
 def _inner(key: str, table: object, kind: type, written: str, place: str) -> object:

@@ -102,7 +102,7 @@ def training_figure(rows: Sequence[Mapping]) -> Figure:
     """Losses, average precision, F1 and learning rate against the training step.
 
     rows: as read from metrics.jsonl, in order. Keys `step`, `phase`, `loss`, `validation_loss`, `learning_rate`, and
-    `average_precision` and `f1` by event; a row may lack any but `step`.
+    `average_precision` and `f1` by event; a row may lack any but `step`, and what is no number is not drawn.
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
@@ -128,11 +128,11 @@ def training_figure(rows: Sequence[Mapping]) -> Figure:
 
 
 def _series(rows: Sequence[Mapping], key: str, name: str | None = None) -> tuple[list, list]:
-    """Steps and values of the rows that have the key, and under it the name."""
+    """Steps and values of the rows that have a number under the key, and under it the name."""
     values = [(row["step"], row.get(key)) for row in rows]
     if name is not None:
-        values = [(step, value.get(name)) for step, value in values if value is not None]
-    kept = [(step, value) for step, value in values if value is not None]
+        values = [(step, value.get(name)) for step, value in values if isinstance(value, Mapping)]
+    kept = [(step, value) for step, value in values if type(value) in (int, float)]
     return [step for step, _ in kept], [value for _, value in kept]
 
 
@@ -143,7 +143,7 @@ def _draw_series(ax, steps: list, values: list, **style) -> None:
 
 def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
     """A line where a phase of training begins, and its number."""
-    for before, after in pairwise(row for row in rows if row.get("phase") is not None):
+    for before, after in pairwise(row for row in rows if type(row.get("phase")) is int):
         if before["phase"] != after["phase"]:
             ax.axvline(before["step"], color="0.4", linewidth=1, linestyle=":")
             ax.annotate(f"phase {after['phase']}", (before["step"], 1), (3, -10), **_PHASE)

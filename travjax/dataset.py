@@ -8,8 +8,7 @@ import dataclasses
 import hashlib
 import json
 import math
-import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -20,14 +19,23 @@ from typing import Any
 import numpy as np
 
 from travjax.actions import ActionSpace
-from travjax.config import InputError, from_json, require, require_number, to_json
+from travjax.config import (
+    InputError,
+    one_line,
+    parts_from_json,
+    read_json,
+    require,
+    require_number,
+    shown,
+    to_json,
+)
 from travjax.files import folder_written_whole, sha256
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
 from travjax.robot import Robot
-from travjax.sampling import random_keys
-from travjax.terrain import STYLES, generate_terrain
+from travjax.sampling import UNKNOWN, random_keys
+from travjax.terrain import STYLES, generate_terrain, require_world
 from travjax.traverse import failures, packed, simulate
 
 FORMAT, FORMAT_VERSION = "travjax data set", 1
@@ -48,12 +56,14 @@ class DatasetConfig:
     maps:             number of maps, the five styles in turn
     seed:             gives the terrain seeds and the splits
     validation, test: shares of the maps, the rest is for training
+    world:            metres, the map size that features are derived from; the maps' own unless given
     """
 
     maps: int = 56_840
     seed: int = 0
     validation: float = 0.08
     test: float = 0.02
+    world: float | None = None
 
     def __post_init__(self):
         whole = lambda value: isinstance(value, Integral) and not isinstance(value, bool)
@@ -62,6 +72,7 @@ class DatasetConfig:
         for name in ("validation", "test"):
             require_number(name, getattr(self, name), -math.inf, 1, "a share from 0 to 1")
             require(getattr(self, name) >= 0, name, getattr(self, name), "a share from 0 to 1")
+        require_world(self.world)
         require(self.validation + self.test <= 1, "validation + test", self.validation + self.test, "at most 1")
 
     def styles(self) -> np.ndarray:
@@ -137,7 +148,8 @@ class Dataset:
 
     def __post_init__(self):
         require(not (self.config and self.provenance), "provenance", "given", "left out where there is a config")
-        maps = self.config.maps if self.config else len(self.split)
+        maps = self.config.maps if self.config else np.size(self.split)
+        require(maps > 0, "split", [], "of one map at least")
         expected = {
             "heights": ((maps, *self.grid.shape), "f4"),
             "labels": ((maps, len(self.actions)), "u1"),
@@ -149,11 +161,13 @@ class Dataset:
         }
         for name, array in self.arrays.items():
             shape, kind = expected[name]
-            fits = array.shape == shape and kind in (array.dtype.kind, array.dtype.str[1:])
+            fits = array.shape == shape and kind in (array.dtype.kind, array.dtype.str[1:]) and array.dtype.isnative
             allowed = f"{list(shape)} of {'text' if kind == 'U' else np.dtype(kind)}"
             require(fits, name, f"{list(array.shape)} of {array.dtype}", allowed)
         wrong = self.split[self.split >= len(SPLITS)]
         require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
+        largest = int(self.labels.max(initial=0))
+        require(largest < 2 * UNKNOWN, "labels", largest, f"from 0 to {2 * UNKNOWN - 1}")
         groups = STYLES if self.config else self.provenance and [site.name for site in self.provenance.sites]
         unknown = self.group[~np.isin(self.group, groups)] if groups else self.group[:0]
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
@@ -192,7 +206,7 @@ def generate(
     labels = np.empty((config.maps, len(actions)), np.uint8)
     for start in range(0, config.maps, CHUNK):
         chunk = slice(start, min(start + CHUNK, config.maps))
-        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid)
+        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid, world=config.world)
         margins = simulate(made, robot, actions, grid=grid)
         labels[chunk] = packed(failures(margins, robot), margins.known)
         heights[chunk] = made
@@ -208,8 +222,8 @@ def require_same(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Gri
         if ours != given:
             fields = [field.name for field in dataclasses.fields(ours)]
             differing = [field for field in fields if getattr(ours, field) != getattr(given, field)]
-            both = (", ".join(f"{field} = {getattr(one, field)!r}" for field in differing) for one in (ours, given))
-            theirs, wanted = (textwrap.shorten(one, 160, placeholder=" ...") for one in both)
+            both = [", ".join(f"{field} = {getattr(one, field)!r}" for field in differing) for one in (ours, given)]
+            theirs, wanted = (one_line(one, 160) for one in both)
             raise InputError(f"{name} of the data set: {theirs}; must be as here: {wanted}")
 
 
@@ -221,9 +235,10 @@ def configs_to_json(dataset: Dataset) -> dict[str, Any]:
 
 
 def put_together(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
-    """The data set of what `configs_to_json` gave and its arrays."""
-    kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid, "config": DatasetConfig}
-    configs = {name: table[name] and from_json(table[name], kind) for name, kind in kinds.items()}
+    """The data set of what `configs_to_json` gave and its arrays; raises InputError when they are something else."""
+    synthetic = table.get("config") is not None
+    kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid} | ({"config": DatasetConfig} if synthetic else {})
+    configs = {"config": None} | parts_from_json(table, kinds)
     places = {name: array for name, array in arrays.items() if name in PROVENANCE_ARRAYS}
     provenance = Provenance.from_json(table["provenance"], **places) if "provenance" in table else None
     parts: dict[str, Any] = configs | {name: arrays[name] for name in ARRAYS}
@@ -251,27 +266,46 @@ def load(folder: str | Path) -> Dataset:
     """
     folder = Path(folder)
     require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
-    table = _read_table(folder / "dataset.json")
-    for name, file in table["files"].items():
-        _verify(folder / name, file["bytes"], file["sha256"])
+    path = folder / "dataset.json"
+    table = _read_table(path)
+    names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
+    for name, (size, digest) in _files_of(table, names, path).items():
+        _verify(folder / name, size, digest)
+    arrays = {name: _read_array(folder / f"{name}.npy") for name in names}
     try:
-        names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
-        return put_together(table, {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in names})
-    except (InputError, OSError, ValueError) as error:
+        return put_together(table, arrays)
+    except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 
 
-def _read_table(path: Path) -> dict[str, Any]:
+def _files_of(table: dict[str, Any], names: Sequence[str], path: Path) -> dict[str, tuple[int, str]]:
+    """Size and checksum of the file of each array, as dataset.json has them."""
+    told, expected = table.get("files"), [f"{name}.npy" for name in names]
+    files = told if isinstance(told, dict) else {}
+    require(files.keys() == set(expected), f"{path}: files", told, f"a table of {', '.join(expected)}")
+    for name, file in files.items():
+        both = isinstance(file, dict) and type(file.get("bytes")) is int and isinstance(file.get("sha256"), str)
+        require(both, f"{path}: files.{name}", file, "a table with bytes and sha256")
+    return {name: (file["bytes"], file["sha256"]) for name, file in files.items()}
+
+
+def _read_array(path: Path) -> np.ndarray:
     try:
-        table = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except ValueError as error:
-        raise InputError(f"{path}: not JSON: {error}") from None
+        array = np.load(path, allow_pickle=False)
+    except Exception as error:  # NumPy raises all sorts over what is no array
+        raise InputError(f"{path}: cannot be read as an array: {str(error) or type(error).__name__}") from None
+    require(isinstance(array, np.ndarray), str(path), type(array).__name__, "a .npy file of one array")
+    return array
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    table = read_json(path)
     if not isinstance(table, dict) or table.get("format") != FORMAT:
         raise InputError(f"{path}: not the description of a {FORMAT}")
     if table.get("version") != FORMAT_VERSION:
-        raise InputError(f"{path}: format version {table.get('version')!r}: must be {FORMAT_VERSION}; make it again")
+        raise InputError(
+            f"{path}: format version {shown(table.get('version'))}: must be {FORMAT_VERSION}; make it again"
+        )
     if table.pop("sha256", None) != _digest(table):
         raise InputError(f"{path}: has been altered: its checksum differs")
     return table
@@ -319,8 +353,9 @@ def _digest(table: dict[str, Any]) -> str:
 def is_dataset(folder: Path) -> bool:
     """Whether the folder holds a data set of any version and nothing else."""
     try:
-        table = json.loads((folder / "dataset.json").read_text())
+        table = read_json(folder / "dataset.json")
         ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS + PROVENANCE_ARRAYS)}
-        return table["format"] == FORMAT and {path.name for path in folder.iterdir()} <= ours
-    except (OSError, ValueError, TypeError, KeyError):
+        described = isinstance(table, dict) and table.get("format") == FORMAT
+        return described and {path.name for path in folder.iterdir()} <= ours
+    except (OSError, InputError):
         return False

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from travjax.config import InputError
+from travjax.config import InputError, one_line
 from travjax.files import cache_folder, output_folder
 
 
@@ -42,7 +42,7 @@ def guarded(work: Callable[[], object]) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:  # a name too long, no permission
-        print(f"travjax: {error.filename or 'a file'}: {error.strerror or error}", file=sys.stderr)
+        print(one_line(f"travjax: {error.filename or 'a file'}: {error.strerror or error}"), file=sys.stderr)
         return 2
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):

@@ -1,5 +1,6 @@
 """Evaluation of a trained estimator on the test maps of a data set (SPEC section 10)."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
@@ -22,6 +23,9 @@ from travjax.training_step import LARGE_MARGIN
 from travjax.traverse import as_in_paper, simulate, unpacked
 
 Progress = Callable[[int], object]
+
+SPARSEST = 6
+"""A figure shows every sixth trajectory at least."""
 
 REGRESSION_SAMPLES = 50_000
 """Training samples that the logistic regression is fitted to, at most."""
@@ -100,12 +104,23 @@ class Evaluator:
         return test[labelling.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
 
     def whole_maps(
-        self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None
+        self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None, every: int = 1
     ) -> np.ndarray:
-        """Probabilities of all trajectories of maps [k]: [k, t, 3]."""
-        trajectories = len(self.run.actions)
-        samples = (np.repeat(maps, trajectories), np.tile(np.arange(trajectories), len(maps)))
-        return self.probabilities(estimator, samples, on_progress).reshape(len(maps), trajectories, -1)
+        """Probabilities of all trajectories of maps [k], or of every so many: [k, t, 3]."""
+        trajectories = np.arange(0, len(self.run.actions), every)
+        samples = (np.repeat(maps, len(trajectories)), np.tile(trajectories, len(maps)))
+        return self.probabilities(estimator, samples, on_progress).reshape(len(maps), len(trajectories), -1)
+
+    def every(self, maps: int, samples: int) -> int:
+        """Every how many trajectories of so many maps to show, so that a figure takes no longer than `samples` do.
+
+        At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. The hazard field reads
+        all trajectories of a map at once: all are shown.
+        """
+        if isinstance(self.source, MapSource):
+            return 1
+        most = min(SPARSEST, -(-maps * len(self.run.actions) // samples))
+        return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)
 
     def regression(self, samples: Samples) -> np.ndarray:
         """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""

@@ -4,11 +4,12 @@
 The robot starts at (0, 0) and faces +y.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
-from travjax.config import require, require_number
+from travjax.config import require, require_length, require_number
 
 HIGHEST = 30_000.0
 """Metres: what is higher, or as deep, is no height."""
@@ -26,10 +27,9 @@ class Grid:
     spacing: float = 0.0625
 
     def __post_init__(self):
-        require_number("size", self.size, 0, 1000, "an edge length in metres, at most 1000")
-        require_number(
-            "spacing", self.spacing, 0, self.size, "a distance in metres, above 0 and at most the map's size"
-        )
+        require_length("size", self.size, 0.001, 1000)
+        allowed = "a distance in metres, from 0.001 and at most the map's size"
+        require_number("spacing", self.spacing, math.nextafter(0.001, 0), self.size, allowed)
         cells = self.size / self.spacing
         require(
             abs(cells - round(cells)) < 1e-6, "spacing", self.spacing, f"a whole fraction of the size {self.size:g} m"

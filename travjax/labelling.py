@@ -11,6 +11,7 @@ import numpy as np
 
 from travjax.actions import ActionSpace
 from travjax.batching import BATCH
+from travjax.config import one_line
 from travjax.dem import Windows
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -20,13 +21,13 @@ from travjax.traverse import failures, simulate
 Batch = dict[str, np.ndarray]
 
 
-def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid) -> Iterator[Batch]:
-    """Maps of the styles and seeds [n], with the parameters and noise seeds that make them again."""
+def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: float | None = None) -> Iterator[Batch]:
+    """Maps of the styles and seeds [n] in a world, with the parameters and noise seeds that make them again."""
     for start in range(0, len(seeds), BATCH):
         names, numbers = styles[start : start + BATCH], seeds[start : start + BATCH]
         params, noise_seeds = sample_params(names, numbers)
         yield {
-            "heights": np.asarray(elevation(params, noise_seeds, grid=grid)),
+            "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
             "group": np.array(names),
             "seed": np.array(numbers),
             "noise_seed": np.asarray(noise_seeds),
@@ -85,4 +86,4 @@ def title(maps: Batch, index: int) -> str:
     """One line that tells a map from the others: its group, and its seed or south-west corner."""
     seed = "seed" in maps
     where = f"seed {maps['seed'][index]}" if seed else "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])
-    return f"{maps['group'][index][:30]}, {where}"
+    return f"{one_line(maps['group'][index], 30)}, {where}"

@@ -3,6 +3,7 @@
 Functions return a matplotlib Figure; `save` writes it. Nothing here needs a display.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from matplotlib.text import Text
 
 from travjax.actions import ActionSpace
+from travjax.config import one_line
 from travjax.files import written_whole
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -27,10 +30,22 @@ TERRAIN = "gist_earth"
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Writes a figure as PNG, whole or not at all."""
-    with written_whole(path) as temporary:
+    """Writes a figure as PNG, whole or not at all; names in it are drawn as they are."""
+    _draw_texts_as_they_are(figure)
+    with written_whole(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # of a name: a box is drawn
         figure.savefig(temporary, format="png", dpi=150)
     return path
+
+
+def _draw_texts_as_they_are(figure: Figure) -> None:
+    """Takes no text for mathematics, such as a name with two $, but the numbers of axes, which are set in it."""
+    axes = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
+    numbers = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
+    for text in figure.findobj(Text):
+        if text not in numbers:
+            text.set_parse_math(False)
+            text.set_text("\n".join(one_line(line) for line in text.get_text().split("\n")))
 
 
 def contact_sheet(heights: np.ndarray, titles: Sequence[str], heading: str, grid: Grid) -> Figure:
@@ -97,13 +112,16 @@ def predicted_maps(
     robot: Robot,
     actions: ActionSpace,
     grid: Grid,
+    labelled: str = "true",
+    every: int = 1,
 ) -> Figure:
-    """For each map the elevation and, for each event, the action space as predicted and in the last row the truth.
+    """For each map the elevation and, for each event, the action space as predicted and in the last row as labelled.
 
     heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3], None if that is
-    not to be shown; known: [n, t]. The paper's qualitative figure.
+    not to be shown; known: [n, t]; labelled: what the last row is called; every: t are every so many of the action
+    space. The paper's qualitative figure.
     """
-    paths = actions.poses(np.arange(len(actions)))[..., :2]
+    paths = actions.poses(np.arange(0, len(actions), every))[..., :2]
     rows = len(predictions) + (failed is not None)
     figure = Figure(figsize=(13, 3.15 * rows * len(heights) + 0.5), layout="constrained")
     axes = figure.subplots(rows * len(heights), 4, sharex=True, sharey=True, squeeze=False)
@@ -123,7 +141,7 @@ def predicted_maps(
             drawn = [(what, p >= FAILURE, _by_probability(p, known[one])) for what, p in columns]
             if failed is not None:
                 fails = failed[one, :, event]
-                drawn.append(("true", fails, _by_label(fails, known[one])))
+                drawn.append((labelled, fails, _by_label(fails, known[one])))
             for ax, (what, mask, by_colour) in zip(of_map[:, 1 + event], drawn, strict=True):
                 _draw_elevation(ax, heights[one], grid, *_colour_range(heights[one]), colour="gray", alpha=0.35)
                 _draw_paths(ax, paths, by_colour)
@@ -135,7 +153,8 @@ def predicted_maps(
         axes[1, 0].legend(handles=bands, loc="center")
     else:
         figure.legend(handles=bands, loc="outside lower center", ncols=len(bands))
-    figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
+    shown = f"{len(paths)} of the {len(actions)}" if every > 1 else f"{len(actions)}"
+    figure.suptitle(f"{shown} trajectories of {robot.name}", x=0.02, ha="left")
     return figure
 
 

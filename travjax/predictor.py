@@ -38,12 +38,20 @@ class Predicted:
     margins: Float[np.ndarray, "*n t 3"] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Predictor:
     """A trained estimator, and the run that it comes from."""
 
     run: Run
     network: Network
+
+    def __repr__(self) -> str:
+        run = self.run
+        return (
+            f"Predictor({run.preset.model} for {run.robot.name},\n"
+            f"          {len(run.actions)} trajectories of maps of {run.grid.size:g} x {run.grid.size:g} m at "
+            f"{run.grid.spacing:g} m)"
+        )
 
     @staticmethod
     def load(source: str | Path | None = None, which: str = "best") -> "Predictor":

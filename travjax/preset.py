@@ -5,7 +5,7 @@ from pathlib import Path
 
 import optax
 
-from travjax.config import load_toml, require, require_number
+from travjax.config import load_toml, require, require_length, require_number
 from travjax.corruption import CorruptionConfig
 from travjax.dataset import DatasetConfig
 from travjax.estimator import HeadsConfig
@@ -18,11 +18,15 @@ SCHEDULES = ("constant", "cosine")
 
 METHODS = ("rmsprop", "adamw")
 
+MOST = 2**31 - 1
+"""Of anything that is counted, and the largest seed."""
+
 
 def _require_counts(config: object, *names: str, least: int) -> None:
     for name in names:
         value = getattr(config, name)
         require(type(value) is int and value >= least, name, value, f"a whole number, at least {least}")
+        require(value <= MOST, name, value, f"at most {MOST}")
 
 
 @dataclass(frozen=True)
@@ -76,9 +80,6 @@ class TrainingConfig:
         _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
         if self.subset_seed is not None:
             _require_counts(self, "subset_seed", least=0)
-        for name in ("seed", "subset_seed"):
-            value = getattr(self, name)
-            require(value is None or value < 2**31, name, value, f"at most {2**31 - 1}")
         require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
         require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
         require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
@@ -168,7 +169,7 @@ class Preset:
         for name in ("robot", "weights"):
             value = getattr(self, name)
             require(isinstance(value, str) and bool(value), name, value, "a non-empty text")
-        require_number("elevation_scale", self.elevation_scale, 0, 1000, "a length in metres, above 0 and at most 1000")
+        require_length("elevation_scale", self.elevation_scale, 0.001, 1000)
 
     @staticmethod
     def load(path: str | Path) -> "Preset":

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax.config import from_json, load_toml, require, require_number, to_json
+from travjax.config import from_json, load_toml, parts_from_json, require, require_number, to_json
 from travjax.dem_options import DemOptions
 
 SPLITS = ("train", "validation", "test")
@@ -151,6 +151,16 @@ class SiteRecord:
     near_test: int
     shared: int
 
+    def __post_init__(self):
+        for name in ("name", "file", "sha256"):
+            require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
+        require(self.crs is None or isinstance(self.crs, str), "crs", self.crs, "a text, or none")
+        for name in ("cell_size", "height_offset", "covered", "filled", "unknown"):
+            require_number(name, getattr(self, name), -math.inf, math.inf, "a number")
+        for name in ("windows", *SPLITS, "too_unknown", "near_test", "shared"):
+            value = getattr(self, name)
+            require(type(value) is int and 0 <= value < 2**63, name, value, "a whole number, at least 0")
+
 
 @dataclass(frozen=True, eq=False)
 class Provenance:
@@ -184,10 +194,12 @@ class Provenance:
         return {"config": to_json(self.config), "sites": [to_json(site) for site in self.sites]}
 
     @staticmethod
-    def from_json(table: dict[str, Any], origin: np.ndarray, quarter_turns: np.ndarray) -> "Provenance":
-        """From what `to_json` gave, and the arrays."""
-        sites = tuple(from_json(site, SiteRecord) for site in table["sites"])
-        return Provenance(origin, quarter_turns, from_json(table["config"], SitesConfig), sites)
+    def from_json(table: Any, origin: np.ndarray, quarter_turns: np.ndarray) -> "Provenance":
+        """From what `to_json` gave, and the arrays; raises InputError over anything else."""
+        config = parts_from_json(table, {"config": SitesConfig})["config"]
+        sites = table.get("sites")
+        require(isinstance(sites, list), "sites", sites, "a list of tables")
+        return Provenance(origin, quarter_turns, config, tuple(from_json(site, SiteRecord) for site in sites))
 
 
 PROVENANCE_ARRAYS = ("origin", "quarter_turns")

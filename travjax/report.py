@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 from tabulate import tabulate
 
-from travjax.metrics import NAMES, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
+from travjax.config import QUOTED, one_line
+from travjax.metrics import NAMES, OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
 from travjax.traverse import EVENTS
 
 PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure": 0.096}
@@ -15,6 +16,10 @@ PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure
 
 AT_ONCE = 1024
 """Maps whose flags are looked at together: they may lie on the disk."""
+
+
+TOLERANCE = 0.1
+"""By which the mean probability may differ from the frequency of failures and still be called right."""
 
 
 def shares_table(
@@ -101,11 +106,26 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
     return with_notes(_table(rows, headers), notes)
 
 
+def calibration_line(evaluation: Evaluation) -> str:
+    """One line: mean probability and measured frequency of failures, and whether probabilities are too high or low."""
+    bins = evaluation.calibration
+    means = [f"{name} {bins[name].mean_probability:.4f} ({bins[name].frequency:.4f})" for name in NAMES]
+    overall = bins[OVERALL]
+    ratio = overall.mean_probability / overall.frequency if overall.frequency else math.inf
+    verdict = "too high" if ratio > 1 + TOLERANCE else "too low" if ratio < 1 - TOLERANCE else "right"
+    times = f"{ratio:.2f} times the frequency" if overall.frequency else "no sample fails"
+    return (
+        f"Calibration, mean probability and in brackets the measured frequency of failures: {', '.join(means)}. "
+        f"Overall the probabilities are {verdict} on average, {times}; reliability.png shows them by bin."
+    )
+
+
 def groups_table(evaluation: Evaluation) -> str:
     """For each group its samples and, of each event, the share that fails, F1 and average precision."""
     rows = []
     undefined: dict[str, list[str]] = {event: [] for event in EVENTS}
     for group, scores in [*evaluation.groups.items(), ("all", evaluation.scores)]:
+        group = one_line(group, QUOTED)
         events = [scores[event] for event in EVENTS]
         failures = [f"{one.confusion.failures:.2%}" for one in events]
         f1 = [_share(one.confusion.f1) for one in (*events, scores["overall"])]
@@ -158,7 +178,8 @@ def _why_undefined(what: str, counts: Confusion) -> str:
 
 
 def _table(rows: list[list[str]], headers: Sequence[str]) -> str:
-    return tabulate(rows, headers, disable_numparse=True, stralign="right", colalign=("left",))
+    shown = [[one_line(cell, QUOTED) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    return tabulate(shown, headers, disable_numparse=True, stralign="right", colalign=("left",))
 
 
 def with_notes(table: str, notes: Iterable[str]) -> str:

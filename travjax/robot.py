@@ -4,17 +4,21 @@ import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from travjax.config import InputError, load_toml, require, require_number
+from travjax.config import InputError, load_toml, require, require_length, require_number
 
 PRESETS = Path(__file__).parent / "robots"
+
+LONGEST_NAME = 100
+"""Characters."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """Dimensions and limits of a robot; metres and radians.
+    """Dimensions and limits of a robot; metres and radians, lengths from a millimetre to 100 m.
 
+    name:           what tables and figures call it, in one line
     wheelbase:      front to rear wheel centres
-    track:          left to right wheel centres
+    track:          left to right wheel centres; beside and below the chassis the wheels stay out of it
     wheel_diameter, wheel_width
     chassis_length, chassis_width: the body that can hit the ground, centred on the wheels
     overall_length, overall_width: outer dimensions, for pictures
@@ -39,11 +43,22 @@ class Robot:
     max_tilt: float = field(metadata={"angle": True})
 
     def __post_init__(self):
-        require(isinstance(self.name, str) and bool(self.name), "name", self.name, "a non-empty text")
+        named = isinstance(self.name, str) and 0 < len(self.name) <= LONGEST_NAME and self.name.isprintable()
+        require(named, "name", self.name, f"a non-empty text of one line, at most {LONGEST_NAME} characters")
         for one in fields(self):
             if one.name not in ("name", "max_tilt"):
-                require_number(one.name, getattr(self, one.name), 0, 100, "a length in metres, above 0 and at most 100")
-        require_number("max_tilt", self.max_tilt, 0, math.pi / 2, "an angle above 0 and at most 90 degrees (pi/2 rad)")
+                require_length(one.name, getattr(self, one.name), 0.001, 100)
+        allowed = "an angle from 0.01 to 90 degrees (pi/2 rad)"
+        require_number("max_tilt", self.max_tilt, math.radians(0.0099), math.pi / 2, allowed)
+        self._require_wheels_outside()
+
+    def _require_wheels_outside(self) -> None:
+        """Refuses wheels that would be inside the chassis: beside, along and in height."""
+        least = self.chassis_width + self.wheel_width
+        along = self.wheelbase - self.wheel_diameter < self.chassis_length
+        inside = self.track < least - 1e-9 and along and self.ride_height < self.wheel_diameter
+        allowed = f"at least chassis_width + wheel_width = {self.chassis_width:g} + {self.wheel_width:g} = {least:g} m"
+        require(not inside, "track", self.track, f"{allowed}, or the wheels are inside the chassis")
 
     @staticmethod
     def load(source: "str | Path | Robot") -> "Robot":

@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from travjax.config import InputError
+from travjax.config import InputError, one_line, parse_json
 from travjax.files import written_whole
 
 
@@ -61,18 +61,29 @@ class RunLog:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a metrics.jsonl, none if there is no file; a last line that was cut short does not count."""
+    """Reads the rows of a metrics.jsonl, none if there is no file, and prints which lines are no rows with their step.
+
+    They are left out: a run does not stop over a damaged log. A last line that was cut short is passed over in silence.
+    Raises InputError when the file cannot be read.
+    """
     try:
-        lines = path.read_text().splitlines()
+        *lines, last = path.read_bytes().split(b"\n")
     except FileNotFoundError:
         return []
-    rows = []
-    for number, line in enumerate(lines, start=1):
-        try:
-            row = json.loads(line)
-            row["step"] + 0
-            rows.append(row)
-        except (ValueError, LookupError, TypeError):
-            if number < len(lines):
-                raise InputError(f"{path}: line {number}: not a row with its step") from None
-    return rows
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    found = [_row(line) for line in lines]
+    damaged = [str(number) for number, row in enumerate(found, start=1) if row is None]
+    if damaged:
+        numbers = f"line {damaged[0]}" if len(damaged) == 1 else f"{len(damaged)} lines from {damaged[0]} on"
+        print(one_line(f"{path}: {numbers} left out: must be a row of JSON with its step"))
+    return [row for row in (*found, _row(last)) if row is not None]
+
+
+def _row(line: bytes) -> dict[str, Any] | None:
+    """The row of a line; None where it is none."""
+    try:
+        row = parse_json(line.decode(), "row")
+    except (UnicodeDecodeError, InputError):
+        return None
+    return row if isinstance(row, dict) and type(row.get("step")) is int and row["step"] >= 0 else None

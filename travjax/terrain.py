@@ -5,6 +5,7 @@ fields, mixed by a third one: Z = plains * w + mountains * (1 - w). All three sh
 """
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from travjax.batching import in_batches
-from travjax.config import InputError, require
+from travjax.config import InputError, require, require_number
 from travjax.grid import Grid
 from travjax.noise import SEEDS, noise_on_axes, permutation_table
 
@@ -43,7 +44,7 @@ class TerrainParams:
     perc_obstacles, smooth_transition: where the mixing noise (0 to 1) turns from mountains to plains, and how softly
     distribution_x, distribution_y:    0 to 1, how often plains and mountains alternate along x and y
     height_obstacles:                  metres, height of the mountains (negative: craters)
-    smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres on an M metre map
+    smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres, M the map size or the `world`
     slopes_variation:                  exponent of the plains
     max_slope_variation:               scale of the plains
     """
@@ -134,15 +135,18 @@ _LIMITS = np.array(
 """[style, half, field, (low, high)]."""
 
 
-def generate_terrain(style: str | Sequence[str], seeds, *, grid: Grid = Grid()) -> Float[Array, "n rows cols"]:
+def generate_terrain(
+    style: str | Sequence[str], seeds, *, grid: Grid = Grid(), world: float | None = None
+) -> Float[Array, "n rows cols"]:
     """Maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
 
     style: one of STYLES, or a sequence with one for each seed
     seeds: integers in [0, 2^32): a sequence, a range or one number
+    world: as `elevation` takes it
     Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1.
-    Raises InputError for an unknown style, no or bad seeds, or another number of styles than of seeds.
+    Raises InputError for an unknown style, no or bad seeds, another number of styles than of seeds, or a bad world.
     """
-    return elevation(*sample_params(style, seeds), grid=grid)
+    return elevation(*sample_params(style, seeds), grid=grid, world=world)
 
 
 def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, " n"]]:
@@ -175,12 +179,23 @@ def _sample(style, seed):
     return jax.vmap(sample_one)(style, seed)
 
 
-def elevation(params: TerrainParams, noise_seed, *, grid: Grid = Grid()) -> Float[Array, "*n rows cols"]:
+def require_world(world: float | None) -> None:
+    """Raises InputError unless `world` is None or a map size that features may be derived from."""
+    if world is not None:
+        require_number("world", world, math.nextafter(1, 0), 1000, "a map size in metres from 1 to 1000")
+
+
+def elevation(
+    params: TerrainParams, noise_seed, *, grid: Grid = Grid(), world: float | None = None
+) -> Float[Array, "*n rows cols"]:
     """Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
 
     noise_seed: an integer in [0, 10000), or [n] of them; these and the parameters are looked at, so not under `jit`
-    Raises InputError when the noise seed, or a parameter that shapes the noise, lies outside what is allowed.
+    world:      metres, the map size M from which features are derived; the grid's own unless given. Maps of one world
+                and different size are the same where they overlap
+    Raises InputError when the noise seed, a parameter that shapes the noise, or the world lies outside what is allowed.
     """
+    require_world(world)
     seeds = np.asarray(noise_seed)
     inside = np.issubdtype(seeds.dtype, np.integer) and seeds.size and seeds.min() >= 0 and seeds.max() < SEEDS
     require(bool(inside), "noise_seed", noise_seed, f"an integer from 0 to {SEEDS - 1}")
@@ -196,18 +211,19 @@ def elevation(params: TerrainParams, noise_seed, *, grid: Grid = Grid()) -> Floa
     require(len(shape) < 2, "params", f"arrays of shape {shape}", "numbers or [n] arrays")
     columns = [jnp.asarray(np.broadcast_to(value, shape).reshape(-1)) for value in (*values, seeds.astype(np.int32))]
     batched = (TerrainParams(*columns[:-1]), columns[-1])
-    maps = in_batches(lambda batch: _elevation(*batch, permutation_table(), grid), batched)
+    size = grid.size if world is None else float(world)
+    maps = in_batches(lambda batch: _elevation(*batch, permutation_table(), grid, size), batched)
     return maps if shape else maps[0]
 
 
-@partial(jax.jit, static_argnames="grid")
-def _elevation(params: TerrainParams, noise_seeds, permutations, grid: Grid):
-    return jax.vmap(lambda one, seed: _elevation_of_one(one, permutations[seed], grid))(params, noise_seeds)
+@partial(jax.jit, static_argnames=("grid", "world"))
+def _elevation(params: TerrainParams, noise_seeds, permutations, grid: Grid, world: float):
+    return jax.vmap(lambda one, seed: _elevation_of_one(one, permutations[seed], grid, world))(params, noise_seeds)
 
 
-def _elevation_of_one(params: TerrainParams, permutation, grid: Grid) -> Float[Array, "rows cols"]:
+def _elevation_of_one(params: TerrainParams, permutation, grid: Grid, world: float) -> Float[Array, "rows cols"]:
     axis = jnp.asarray(grid.axis(), jnp.float32)
-    smallest, largest = 1 / grid.size, grid.size
+    smallest, largest = 1 / world, world
 
     def noise(feature_x, feature_y):
         reach = grid.size / 2 / smallest
@@ -220,7 +236,7 @@ def _elevation_of_one(params: TerrainParams, permutation, grid: Grid) -> Float[A
     weight = jnp.where(mix < start, 0.0, jnp.where(mix > end, 1.0, between))
 
     feature = (largest - smallest) * params.smooth_plains + smallest
-    base = jnp.maximum(noise(feature, feature) + 1, 0) * params.max_slope_variation * 0.15 * grid.size
+    base = jnp.maximum(noise(feature, feature) + 1, 0) * params.max_slope_variation * 0.15 * world
     plains = base**params.slopes_variation - 0.8
 
     feature = (largest - smallest) * params.smooth_mountains + smallest

@@ -30,7 +30,7 @@ from travjax.parallel import Devices
 from travjax.prediction import feature_logits, features_of, logits_of, probabilities
 from travjax.runlog import RunLog
 from travjax.sampling import Samples
-from travjax.trained import TRAINED, Network, Run
+from travjax.trained import TRAINED, Network, Run, checked_meta
 from travjax.training_data import TrainingData
 from travjax.training_step import State, is_finite, update
 
@@ -118,7 +118,8 @@ class Trainer:
 
         Raises InputError when there is none, or it was trained on another data set.
         """
-        template = lambda meta: self.run.template(meta["optimizer"], self.devices.everywhere)
+        optimizer = lambda meta: checked_meta(meta, self.folder)["optimizer"]
+        template = lambda meta: self.run.template(optimizer(meta), self.devices.everywhere)
         self.state, meta = self.checkpoints.restore(template)
         trained_on, given = meta["dataset"], self.data.dataset.fingerprint
         require(trained_on == given, "data set", given, f"{trained_on}, the one that the run was trained on so far")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import travjax.estimator
 import travjax.field
 from travjax.actions import ActionSpace
 from travjax.checkpoint import Checkpoints
-from travjax.config import InputError, from_json, require, to_json
+from travjax.config import InputError, one_line, parts_from_json, read_json, require, shown, to_json
 from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
 from travjax.field import HazardField
 from travjax.files import written_whole
@@ -30,6 +31,9 @@ from travjax.weight_files import require_finite
 
 TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
 """What each phase trains, and training of the hazard field."""
+
+COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
+"""What a checkpoint says of where training stood: whole numbers, and others."""
 
 DATA = "data"
 """Folder of a run's own data set."""
@@ -65,31 +69,26 @@ class Run:
         return {name: to_json(getattr(self, name)) for name in _PARTS}
 
     @staticmethod
-    def from_json(table: dict[str, Any]) -> "Run":
-        """The inverse of `to_json`; raises all sorts over another table."""
-        return Run(**{name: from_json(table[name], kind) for name, kind in _PARTS.items()})
+    def from_json(table: Any) -> "Run":
+        """The inverse of `to_json`; raises InputError over another table."""
+        return Run(**parts_from_json(table, _PARTS))
 
     @staticmethod
     def load(folder: str | Path) -> "Run":
         """Reads run.json; raises InputError when it is missing or wrong."""
         path = Path(folder) / "run.json"
+        table = read_json(path, "the folder of a training run")
         try:
-            return Run.from_json(json.loads(path.read_text()))
-        except OSError as error:
-            raise InputError(
-                f"{path}: cannot be read: {error.strerror}; allowed: the folder of a training run"
-            ) from None
+            return Run.from_json(table)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
-        except (ValueError, LookupError, TypeError, AttributeError):
-            raise InputError(f"{path}: not the run.json of a training run") from None
 
     def require_same(self, other: "Run", what: str) -> None:
         """Raises InputError that names the first setting in which the other run differs."""
         free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.each")}
         for name, mine, others in _settings(self, other):
             if mine != others and name not in free:
-                raise InputError(f"{what}: {name} = {others!r}: must be {mine!r}, as in the run so far")
+                raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
 
     def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
         """An estimator with random parameters, or a ResNet with a trunk of `weights`.
@@ -143,6 +142,19 @@ def has_checkpoints(folder: Path) -> bool:
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
+def checked_meta(meta: dict, folder: str | Path) -> dict:
+    """Returns what training said of a checkpoint; raises InputError that names the run's folder where it did not."""
+    where, told = f"{folder}: meta of a checkpoint", meta.get("position")
+    position = told if isinstance(told, dict) else {}
+    require(meta.get("optimizer") in (0, 1, 2), f"{where}: optimizer", meta.get("optimizer"), "0, 1 or 2")
+    require(isinstance(meta.get("dataset"), str), f"{where}: dataset", meta.get("dataset"), "a fingerprint")
+    counted = all(type(position.get(name)) is int and position[name] >= 0 for name in COUNTS)
+    summed = all(type(position.get(name)) in (int, float) and abs(position[name]) < math.inf for name in SUMS)
+    whole = counted and summed and position["phase"] in (1, 2) and len(position) == len(COUNTS + SUMS)
+    require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
+    return meta
+
+
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
@@ -151,9 +163,9 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     """
     run = Run.load(folder)
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
-    state, meta = checkpoints.restore(lambda meta: run.template(meta["optimizer"]), which)
+    state, meta = checkpoints.restore(lambda meta: run.template(checked_meta(meta, folder)["optimizer"]), which)
     for notice in checkpoints.notices:
-        print(notice)
+        print(one_line(notice))
     variables = {name: state[name] for name in VARIABLES}
     for name, leaf in named_leaves(variables).items():
         require_finite(f"{folder}, checkpoint {which}: {name}", np.asarray(leaf))

@@ -21,12 +21,12 @@ from travjax.files import output_folder, save_npz
 from travjax.imagenet import load_weights
 from travjax.models import FIELD
 from travjax.parallel import Devices
-from travjax.preset import TrainingConfig, find_weights
+from travjax.preset import MOST, TrainingConfig, find_weights
 from travjax.runlog import read_rows
 from travjax.sampling import Samples, natural_sample
 from travjax.train import Trainer
 from travjax.train_field import trainer_of
-from travjax.trained import Network, Run, has_checkpoints, load_estimator
+from travjax.trained import Network, Run, checked_meta, has_checkpoints, load_estimator
 
 ARMS = ("random", "ImageNet", "ImageNet + synthetic")
 """What the runs begin with, in the paper's order."""
@@ -65,8 +65,9 @@ class TransferConfig:
             require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
         for name in ("each", "shown_maps"):
             value = getattr(self, name)
-            require(type(value) is int and value >= 0, name, value, "a whole number, at least 0")
-        whole = bool(self.seeds) and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
+            require(type(value) is int and 0 <= value <= MOST, name, value, f"a whole number from 0 to {MOST}")
+        whole = isinstance(self.seeds, tuple) and bool(self.seeds)
+        whole = whole and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
         allowed = "different whole numbers from 0, at least one"
         require(whole and len(set(self.seeds)) == len(self.seeds), "seeds", self.seeds, allowed)
         both = self.training.head_epochs and self.training.epochs
@@ -127,7 +128,13 @@ class Transfer:
             self._require_same(place, run)
         if not self._is_finished(place):
             self._train(arm, seed, place)
-        return [row for row in read_rows(place / "metrics.jsonl") if "watched" in row]
+        path = place / "metrics.jsonl"
+        rows = [row for row in read_rows(path) if "watched" in row]
+        found, last, sites = [row.get("epoch") for row in rows], self.config.epochs, list(self.held_out)
+        scored = all(isinstance(row["watched"], dict) and list(row["watched"]) == sites for row in rows)
+        anew = f"0 to {last}, each with scores of {', '.join(sites)}; remove the folder to train it anew"
+        require(found == list(range(last + 1)) and scored, f"{path}: epochs", found, anew)
+        return rows
 
     def estimator(self, arm: str, seed: int) -> Network:
         """Of the epoch that is best on the validation windows."""
@@ -150,6 +157,7 @@ class Transfer:
             meta = load_meta(place / "checkpoints")
         except InputError:
             return False
+        checked_meta(meta, place)
         begun, given = meta["dataset"], self.dataset.fingerprint
         require(begun == given, f"{place}: data set", given, f"{begun}, the one that the run was trained on")
         return meta["position"]["epoch"] == self.config.epochs
@@ -183,13 +191,20 @@ class Transfer:
     def _share_features(self, trainer: Trainer, arm: str) -> None:
         """The features of a frozen trunk, kept in a file for its other seeds and for a run that goes on."""
         path, fingerprint = self.folder / "features" / f"{_name(arm)}.npz", self.dataset.fingerprint
-        if path.exists():
-            with np.load(path) as file:
-                kept = dict(file)
-            if str(kept.pop("dataset")) == fingerprint:
-                trainer.features = kept
-                return
+        kept = _kept_features(path)
+        if str(kept.pop("dataset", None)) == fingerprint:
+            trainer.features = kept
+            return
         save_npz(output_folder(path.parent) / path.name, dataset=fingerprint, **trainer.features)
+
+
+def _kept_features(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file of features; none where there is no file or it is damaged, since they can be made anew."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except Exception:  # NumPy and zipfile raise all sorts over a damaged file
+        return {}
 
 
 def _name(arm: str) -> str:

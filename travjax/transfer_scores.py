@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from travjax.config import require
 from travjax.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, to_json
 from travjax.report import rows_table, with_notes
 
@@ -23,6 +24,8 @@ PAPER_BEST = {
     "ImageNet + synthetic": {"recall": 0.76, "precision": 0.31, "f1": 0.46},
 }
 """The paper's best epoch of each arm on its own site, where 0.2 % of the trajectories fail (SPEC section 10)."""
+
+COUNTS = ("tn", "fp", "fn", "tp")
 
 Confusions = dict[str, dict[str, Confusion]]
 """By site, ALL among them, and by event, "overall" among them."""
@@ -42,16 +45,31 @@ class Epoch:
 
     @staticmethod
     def of(row: Mapping) -> "Epoch":
-        """From a row of metrics.jsonl with the scores of watched samples."""
-        counts = ("tn", "fp", "fn", "tp")
+        """From a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
+        allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
+        require(_is_scored(row), "row of metrics.jsonl", row, allowed)
         sites = {
-            site: {name: Confusion(*(scores[name]["confusion"][count] for count in counts)) for name in NAMES}
+            site: {name: Confusion(*(scores[name]["confusion"][count] for count in COUNTS)) for name in NAMES}
             for site, scores in row["watched"].items()
         }
         if len(sites) > 1:
             sites[ALL] = {name: sum((one[name] for one in sites.values()), Confusion(0, 0, 0, 0)) for name in NAMES}
         precision = row.get("average_precision")
         return Epoch(row["epoch"], precision and precision[OVERALL], sites)
+
+
+def _is_scored(row: Mapping) -> bool:
+    """Whether a row of metrics.jsonl holds counts of every event on each site, and a number from validation if any."""
+    at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
+    sites, precision = row.get("watched"), row.get("average_precision")
+    if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
+        return False
+    counts = [
+        at(at(at(site, name), "confusion"), count) for site in sites.values() for name in NAMES for count in COUNTS
+    ]
+    overall = at(precision, OVERALL) if isinstance(precision, Mapping) and OVERALL in precision else "none"
+    validated = precision is None or type(overall) in (int, float, type(None))
+    return validated and all(type(count) is int and count >= 0 for count in counts)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from travjax.provenance import SIDES, Site, SitesConfig, Strip
 from travjax.robot import Robot
 from travjax.statistics import statistics_table, windows_table
 
-SYNTHETIC = ("maps", "seed", "validation", "test")
+SYNTHETIC = ("maps", "seed", "validation", "test", "world")
 """The options of a synthetic data set."""
 
 REAL = ("test_strip", "validation_strip", "gap", "max_unknown", "no_rotations", *options.DEM_OPTIONS)
@@ -49,6 +49,7 @@ def add(commands: options.Commands) -> None:
         parser.add_argument(
             f"--{name}", type=float, default=share, metavar="SHARE", help=f"share of the maps for {name} ({share:g})"
         )
+    options.add_world(parser)
     _add_real(parser)
     options.add_robot(parser)
     options.add_grid(parser)
@@ -186,6 +187,7 @@ def _strip(name: str, given: list[str] | None) -> Strip:
 
 def made(config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
     """A new synthetic data set, saved in a folder, with progress bars."""
+    options.say_world(config.world, grid)
     make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
     return _saved(make, config.maps, folder, f"--maps = {config.maps}")
 
@@ -200,7 +202,7 @@ def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path,
     """What `make` makes; `total` maps, if that is known before."""
     _require_free(folder)
     try:
-        with tqdm(desc="making", total=total, unit="map") as bar:
+        with tqdm(desc="making", total=total, unit="map", delay=0.1) as bar:  # none where a file is refused at once
             dataset = make(bar.update)
     except MemoryError as error:
         raise InputError(f"{what}: do not fit in memory: {error}") from None

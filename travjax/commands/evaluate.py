@@ -10,9 +10,8 @@ import numpy as np
 from tqdm import tqdm
 
 from travjax.commands import options
-from travjax.config import InputError, require
+from travjax.config import InputError, one_line, require
 from travjax.files import output_folder, written_whole
-from travjax.models import RESNET
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,11 +28,6 @@ FIGURE_MAPS = 2
 """Maps in predictions.png, likewise."""
 
 MARGINS = "regressed margins above their limits"
-
-CALIBRATION = (
-    "Training samples fail more often than these do, so probabilities tend to be too high (reliability.png shows by "
-    "how much); choose a threshold from the table above."
-)
 
 
 def add(commands: options.Commands) -> None:
@@ -129,7 +123,7 @@ def evaluate(
         errors = np.abs(predicted - true).mean(axis=0) * np.asarray(trained.robot.limits)
         others[MARGINS] = evaluator.scores(np.clip(predicted / 2, 0, 1), samples, recalls)  # 0.5 is the limit
     _write_tables(out, scores, others, description, evaluator, errors)
-    _draw(out, evaluator, estimator, scores, others, figure_maps)
+    _draw(out, evaluator, estimator, scores, others, figure_maps, len(samples[0]))
     return scores
 
 
@@ -191,7 +185,7 @@ def _write_tables(
         (headline + "step {steps}").format(**description),
         report.metrics_table(scores, paper),
         report.threshold_table(scores, paper),
-        *([CALIBRATION] if evaluator.run.preset.model == RESNET else []),
+        report.calibration_line(scores),
         report.groups_table(scores),
         report.baselines_table(average_precisions),
     ]
@@ -227,6 +221,7 @@ def _draw(
     scores: "Evaluation",
     others: Mapping[str, "Evaluation"],
     maps: int,
+    samples: int,
 ) -> None:
     from travjax import curves, plots
 
@@ -234,20 +229,25 @@ def _draw(
     print(plots.save(figure, out / "precision_recall.png"))
     print(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
     if maps:
-        print(plots.save(_predictions(evaluator, estimator, maps), out / "predictions.png"))
+        print(plots.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
 
 
-def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Figure":
-    """Prediction over truth on the whole action space of test maps that fail neither nowhere nor everywhere."""
+def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, samples: int) -> "Figure":
+    """Prediction over truth on the action space of test maps that fail neither nowhere nor everywhere.
+
+    samples: those that were evaluated; where they are few, not all trajectories are shown
+    """
     from travjax import plots
     from travjax.traverse import unpacked
 
     data, trained = evaluator.dataset, evaluator.run
     shown = evaluator.to_show(maps)
-    with tqdm(desc="maps for the figure", total=len(shown) * len(trained.actions), unit="sample") as bar:
-        probability = evaluator.whole_maps(estimator, shown, bar.update)
-    failed, known = map(np.asarray, unpacked(data.labels[shown]))
-    titles = [f"{data.group[index]}, map {index}" for index in shown]
+    every = evaluator.every(len(shown), samples)
+    labels = data.labels[shown, ::every]
+    with tqdm(desc="maps for the figure", total=labels.size, unit="sample") as bar:
+        probability = evaluator.whole_maps(estimator, shown, bar.update, every)
+    failed, known = map(np.asarray, unpacked(labels))
+    titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]
     return plots.predicted_maps(
         data.heights[shown],
         {"predicted": probability},
@@ -257,4 +257,5 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int) -> "Fi
         trained.robot,
         trained.actions,
         trained.grid,
+        every=every,
     )

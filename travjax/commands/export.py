@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from travjax.commands import options
-from travjax.config import InputError
+from travjax.config import InputError, read_text
 from travjax.files import written_whole
 from travjax.models import FIELD
 
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _text(path: Path) -> str | None:
-    return path.read_text().strip() if path.exists() else None
+    return read_text(path).strip() if path.exists() else None
 
 
 def card(trained: "Run", notes: dict, name: str, tables: str | None, real: str | None) -> str:

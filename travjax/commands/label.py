@@ -10,7 +10,7 @@ import numpy as np
 from travjax import report, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
-from travjax.config import require
+from travjax.config import one_line, require
 from travjax.dem import load_dem
 from travjax.files import output_folder, written_whole
 from travjax.formats import OTHERS
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     out = output_folder(arguments.out)
 
     as_in_paper = not arguments.dem and traverse.as_in_paper(robot, actions)
-    config = options.configuration_json(robot, actions, grid, files=files)
+    config = options.configuration_json(robot, actions, grid, files=files, world=arguments.world)
     with NpzStream(out / "labels.npz", total, bytes_each(actions, grid), "labelled maps") as labels:
         for batch in options.progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling"):
             labels.append(batch)
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
     """The number of maps, batches of them, and how each DEM file was read."""
-    unused = ("style", "count", "seed") if arguments.dem else options.DEM_OPTIONS
+    unused = ("style", "count", "seed", "world") if arguments.dem else options.DEM_OPTIONS
     for name in unused:
         given = getattr(arguments, name)
         allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
@@ -75,7 +75,8 @@ def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Ba
         return _dem_windows(arguments, grid)
     styles, total, seed = arguments.style or list(STYLES), options.count(arguments), options.seed(arguments)
     names = [styles[number % len(styles)] for number in range(total)]
-    return total, synthetic_batches(names, list(range(seed, seed + total)), grid), []
+    options.say_world(arguments.world, grid)
+    return total, synthetic_batches(names, list(range(seed, seed + total)), grid, arguments.world), []
 
 
 def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Batch], list[dict[str, Any]]]:
@@ -86,13 +87,13 @@ def _dem_windows(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterat
     for path in arguments.dem:
         windows = load_dem(path, grid=grid, **settings)
         systems = dict.fromkeys(windows.systems().tolist())
-        print(
+        said = (
             f"{path}: {len(windows)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
             f"crs {', '.join(map(_shown, systems))}, {windows.filled:.3%} filled in small holes, "
             f"{windows.unknown:.1%} unknown"
         )
-        for note in windows.notes:
-            print(f"{path}: {note}")
+        for line in (said, *(f"{path}: {note}" for note in windows.notes)):
+            print(one_line(line))
         files.append((path.name if names.count(path.name) == 1 else str(path), windows))
         read = {name: getattr(windows, name) for name in ("path", "sha256", "covered", "filled", "unknown", "notes")}
         read |= {"crs": windows.crs, "height_offset": np.ravel(windows.height_offset).tolist()}

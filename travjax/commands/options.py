@@ -17,7 +17,7 @@ from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.labelling import Batch
 from travjax.robot import Robot
-from travjax.terrain import STYLES
+from travjax.terrain import STYLES, require_world
 
 Commands = argparse._SubParsersAction
 """What `add(commands)` of a command adds its parser to."""
@@ -30,7 +30,19 @@ def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> Non
     )
     parser.add_argument("--count", type=int, metavar="N", help=f"number of {each} ({count})")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the first map, counting on from there (0)")
+    add_world(parser)
     parser.set_defaults(default_count=count)
+
+
+def add_world(parser: argparse.ArgumentParser) -> None:
+    """The world of synthetic maps; see `say_world`."""
+    parser.add_argument(
+        "--world",
+        type=float,
+        metavar="M",
+        help="map size in metres that features of synthetic maps are derived from: 8 makes the ground of the paper's "
+        "maps on maps of any size (the maps' own size)",
+    )
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
@@ -40,9 +52,13 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
 
 
+GROWS = "features of synthetic maps grow with it, unless a world is given"
+"""What a map's edge does."""
+
+
 def add_grid(parser: argparse._ActionsContainer) -> None:
     """Size and spacing of maps; see `configuration`."""
-    parser.add_argument("--size", type=float, default=8.0, metavar="M", help="edge of a map in metres (8)")
+    parser.add_argument("--size", type=float, default=8.0, metavar="M", help=f"edge of a map in metres (8); {GROWS}")
     parser.add_argument(
         "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
     )
@@ -116,6 +132,16 @@ def seed(arguments: argparse.Namespace) -> int:
     seed = arguments.seed or 0
     require(0 <= seed < 2**31, "--seed", seed, f"from 0 to {2**31 - 1}")
     return seed
+
+
+def say_world(world: float | None, grid: Grid) -> None:
+    """Prints what maps the features of synthetic maps are those of, where that is not plain; refuses a bad world."""
+    require_world(world)
+    if world is not None and world != grid.size:
+        print(f"synthetic maps of {grid.size:g} m with the features of {world:g} m maps")
+    elif grid.size != Grid().size:
+        paper = f"a world of {Grid().size:g} m makes the ground of the paper's {Grid().size:g} m maps"
+        print(f"synthetic maps of {grid.size:g} m: their features grow with the map; {paper}")
 
 
 def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -15,6 +15,12 @@ from travjax.models import MODELS
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
 
+SIMULATOR = "simulator\non the map as given"
+"""What a figure calls the row below the predictions."""
+
+AGAINST = "Against the simulator on the map as given, its noise included"
+"""What stands above the table of `--check`."""
+
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
@@ -31,7 +37,11 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument("--model", choices=MODELS, help="what the estimator must be")
     parser.add_argument("--robot", metavar="R", help="what the estimator must have been trained for")
-    parser.add_argument("--check", action="store_true", help="the exact simulator beside it")
+    parser.add_argument(
+        "--check",
+        action="store_true",
+        help="the simulator beside it, on the map as given: it takes the noise of a map for ground",
+    )
     options.add_synthetic(parser, count=20, each="maps in all, the styles in turn")
     options.add_dem(parser, stride=8.0)
     parser.add_argument("--no-figures", action="store_true", help="write no figures")
@@ -66,7 +76,9 @@ def run(arguments: argparse.Namespace) -> None:
         arrays |= {f"margin_{name}": predicted.margins[..., k] for k, name in enumerate(("step", "obstacle", "tilt"))}
     if arguments.check:
         arrays |= {"failed": maps["failed"]}
-    config = options.configuration_json(trained.robot, trained.actions, trained.grid, files=files, model=model)
+    config = options.configuration_json(
+        trained.robot, trained.actions, trained.grid, files=files, model=model, world=arguments.world
+    )
     saved = save_npz(out / "predictions.npz", config=config, cell_size=trained.grid.spacing, **arrays)
     with written_whole(out / "shares.txt") as temporary:
         temporary.write_text(text + "\n")
@@ -82,16 +94,16 @@ def _simulated(batch: Batch, predictor) -> Batch:
 
 
 def _checked(maps: Batch, probability: np.ndarray) -> str:
-    """The predictions against the exact simulator on the same maps."""
+    """The predictions against the simulator on the maps as given; on noisy ones that is not what a robot meets."""
     from travjax import metrics, report
 
     known = maps["known"]
     scores = metrics.evaluate(probability[known], maps["failed"][known])
-    return "Against the exact simulator:\n" + report.metrics_table(scores, None)
+    return f"{AGAINST}:\n{report.metrics_table(scores, None)}"
 
 
 def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: Path) -> Path:
-    """The action space of a few maps in safe, doubtful and failing, the simulator's beside it with `check`."""
+    """The action space of a few maps in safe, doubtful and failing; `check` adds the simulator's below it."""
     from travjax import plots
 
     shown, trained = samples(maps), predictor.run
@@ -105,5 +117,6 @@ def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: P
         trained.robot,
         trained.actions,
         trained.grid,
+        SIMULATOR,
     )
     return plots.save(figure, out / "predictions.png")

@@ -30,8 +30,11 @@ def run(arguments: argparse.Namespace) -> None:
     out = output_folder(arguments.out)
     names = [style for style in styles for _ in range(count)]
     seeds = list(range(seed, seed + count)) * len(styles)
-    maps = joined(list(options.progress(synthetic_batches(names, seeds, grid), len(names), "terrain")))
-    print(save_npz(out / "terrain.npz", cell_size=grid.spacing, **maps))
+    options.say_world(arguments.world, grid)
+    batches = synthetic_batches(names, seeds, grid, arguments.world)
+    maps = joined(list(options.progress(batches, len(names), "terrain")))
+    world = grid.size if arguments.world is None else arguments.world
+    print(save_npz(out / "terrain.npz", cell_size=grid.spacing, world=world, **maps))
     for style in styles:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
         titles = [f"seed {seed}" for seed in maps["seed"][chosen]]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from travjax.commands import options
-from travjax.config import InputError, require
+from travjax.config import InputError, one_line, require
 from travjax.files import find_preset, output_folder
 from travjax.models import FOLDERS, MODELS, RESNET
 
@@ -133,7 +133,7 @@ def train(
     output_folder(folder)
     if devices.main:
         wanted.save(folder)
-        print(trainer.summary())
+        print(one_line(trainer.summary()))
     if estimator is None:
         trainer.resume()
     else:
@@ -188,7 +188,10 @@ def _draw_inputs(trainer: "Trainer", folder: Path) -> Path:
     images = render_inputs(
         data.heights[maps], np.arange(4), trajectories, run.robot, run.actions, grid=run.grid, elevation_scale=scale
     )
-    titles = [f"{group}, trajectory {index}" for group, index in zip(data.group[maps], trajectories, strict=True)]
+    titles = [
+        f"{one_line(group, 30)}, trajectory {index}"
+        for group, index in zip(data.group[maps], trajectories, strict=True)
+    ]
     return plots.save(curves.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png")
 
 

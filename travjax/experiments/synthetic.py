@@ -12,6 +12,7 @@ from pathlib import Path
 from travjax.bench import machine
 from travjax.commands import train
 from travjax.commands.evaluate import evaluate
+from travjax.config import read_text
 from travjax.experiments import launch
 from travjax.files import find_preset
 from travjax.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
@@ -60,10 +61,11 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:
     """Of the report."""
-    last = read_rows(folder / "metrics.jsonl")[-1]
+    epochs = [row for row in read_rows(folder / "metrics.jsonl") if type(row.get("samples_per_s")) in (int, float)]
+    steps = [f"{row['step']:,} steps, {row['samples_per_s']:,.0f} samples/s in the last epoch" for row in epochs[-1:]]
     trained = (
         f"{wanted.robot.name}, {len(wanted.actions)} trajectories a map; {wanted.preset.dataset.maps:,} maps; "
-        f"{last['step']:,} steps, {last['samples_per_s']:,.0f} samples/s in the last epoch on {machine()}."
+        f"{''.join(steps) or 'steps are not recorded'} on {machine()}."
     )
     places = [folder / "evaluation" / f"{name}.png" for name in EVALUATION]
     places += [folder / f"{name}.png" for name in TRAINING]
@@ -72,11 +74,11 @@ def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]
         trained,
         *_beside_the_paper(wanted, scores.scores[OVERALL].confusion),
         "## Tables",
-        launch.verbatim((folder / "evaluation" / "tables.txt").read_text().strip()),
+        launch.verbatim(read_text(folder / "evaluation" / "tables.txt").strip()),
         "## Figures",
         *figures,
         "## Configuration",
-        launch.verbatim((folder / "run.json").read_text().strip(), "json"),
+        launch.verbatim(read_text(folder / "run.json").strip(), "json"),
     ]
 
 

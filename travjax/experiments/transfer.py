@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from travjax.commands import evaluate, train
-from travjax.config import InputError, load_toml, require, to_json
+from travjax.config import InputError, load_toml, read_text, require, to_json
 from travjax.experiments import launch
 from travjax.files import find_preset, output_folder, written_whole
 from travjax.models import FIELD, MODELS, RESNET
@@ -79,7 +79,7 @@ def _require_same(out: Path, config) -> None:
     """Keeps the configuration in the folder, and refuses a folder with another one."""
     path = out / "config.json"
     text = json.dumps(to_json(config), indent=1) + "\n"
-    if path.exists() and path.read_text() != text:
+    if path.exists() and read_text(path) != text:
         raise InputError(
             f"--out {out}: holds an experiment of another preset; allowed: another folder, or the same preset"
         )
@@ -163,7 +163,7 @@ def _write(transfer, results, out: Path) -> None:
     if base.preset.weights == "none" and IMAGENET in transfer.arms:
         intro += f" Without ImageNet weights the arm {IMAGENET} begins with random ones as well."
     synthetic = transfer.synthetic / TABLES
-    sections = {"Synthetic test maps": synthetic.read_text().strip()} if synthetic.exists() else {}
+    sections = {"Synthetic test maps": read_text(synthetic).strip()} if synthetic.exists() else {}
     sections |= tables
     pieces: list[launch.Piece] = [
         intro,
