@@ -7,8 +7,11 @@ metadata `items` is a tuple of configurations of that kind, in the file a list o
 
 import dataclasses
 import math
+import os
 import textwrap
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,13 +42,23 @@ def require_number(field: str, value: object, low: float, high: float, allowed: 
     require(math.isfinite(number) and low < number <= high, field, value, allowed)
 
 
+@contextmanager
+def naming(what: object) -> Iterator[None]:
+    """Notes on an error for lack of memory what was being read or made; programs say it in their one line."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:  # the latter XLA's
+        error.add_note(str(what))
+        raise
+
+
 def load_toml(path: str | Path, kind: type[Config]) -> Config:
     """Reads one configuration dataclass from a TOML file.
 
     Raises InputError that names the file when it is missing or not TOML, when a key is unknown or a field without a
     default is absent, and when the dataclass refuses a value.
     """
-    path = Path(path)
+    path = Path(os.path.expanduser(path))
     try:
         with path.open("rb") as file:
             table = tomllib.load(file)

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from travjax.actions import ActionSpace
-from travjax.config import InputError, from_json, require, require_number, to_json
-from travjax.files import folder_written_whole, sha256
+from travjax.config import InputError, from_json, naming, require, require_number, to_json
+from travjax.files import folder_written_whole, put_back, sha256, user_path
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
@@ -236,7 +236,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
     on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
     or when it cannot be written: a full disk, no permission.
     """
-    with folder_written_whole(Path(folder), is_dataset) as temporary:
+    with folder_written_whole(user_path(folder), is_dataset) as temporary:
         arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
@@ -249,14 +249,16 @@ def load(folder: str | Path) -> Dataset:
     Raises InputError, which names folder, file and what is wrong, when something is missing, truncated or altered,
     of another format version, or does not fit together.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
+    put_back(folder)
     require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
     table = _read_table(folder / "dataset.json")
     for name, file in table["files"].items():
         _verify(folder / name, file["bytes"], file["sha256"])
     try:
         names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
-        return put_together(table, {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in names})
+        with naming(folder):
+            return put_together(table, {name: np.load(folder / f"{name}.npy", allow_pickle=False) for name in names})
     except (InputError, OSError, ValueError) as error:
         raise InputError(f"{folder}: {error}") from None
 

@@ -22,6 +22,7 @@ from flax import nnx
 from tabulate import tabulate
 
 from travjax.config import InputError, require
+from travjax.files import user_path
 from travjax.resnet import ResNet, ResNetConfig
 from travjax.weight_files import read_arrays, write_safetensors
 
@@ -134,7 +135,7 @@ def load_weights(path: str | Path, config: ResNetConfig = ResNetConfig()) -> Wei
     do not fit: missing, unexpected, of a wrong shape, no floating-point numbers, not finite, a negative variance. All
     of those are in one error.
     """
-    path = Path(path)
+    path = user_path(path)
     try:
         found, notes = read_arrays(path)
         naming, expected = _recognised(found, config)
@@ -260,7 +261,7 @@ def apply_weights(resnet: ResNet, weights: Weights) -> None:
 def save_safetensors(weights: Weights, path: str | Path) -> None:
     """Writes canonical names and arrays to a file that load_weights reads back, whole or not at all."""
     notes = {key: getattr(weights, key) for key in ("origin", "stride_in", "epsilon")}
-    write_safetensors(Path(path), weights.arrays, notes)
+    write_safetensors(user_path(path), weights.arrays, notes)
 
 
 def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:

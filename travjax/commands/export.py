@@ -5,8 +5,13 @@ from pathlib import Path
 
 from travjax.commands import options
 from travjax.config import InputError
-from travjax.files import written_whole
+from travjax.files import first_lines, require_replaceable, save_text, user_path
 from travjax.models import FIELD
+
+PURPOSE = (
+    "Predicts which trajectories of a wheeled robot fail on an elevation map, and by which event: step, obstacle, tilt."
+)
+"""The sentence after the title of a card."""
 
 
 def add(commands: options.Commands) -> None:
@@ -17,9 +22,9 @@ def add(commands: options.Commands) -> None:
         description="Writes the estimator of a training run to one .safetensors file, which `travjax predict "
         "--checkpoint` takes, and beside it a model card: what it was trained on, and the tables of its evaluation.",
     )
-    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a training run")
+    parser.add_argument("folder", type=user_path, metavar="RUN", help="folder of a training run")
     parser.add_argument("--checkpoint", default="best", metavar="C", help="best or latest (best)")
-    parser.add_argument("--to", type=Path, required=True, metavar="FILE", help=".safetensors file to write")
+    parser.add_argument("--to", type=user_path, required=True, metavar="FILE", help=".safetensors file to write")
     parser.set_defaults(run=run)
 
 
@@ -30,15 +35,30 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.to.suffix != SUFFIX:
         raise InputError(f"--to {arguments.to}: must be a {SUFFIX} file")
+    card = arguments.to.with_suffix(".md")
+    require_replaceable(arguments.to, _is_model, f"--to {arguments.to}", "estimator")
+    require_replaceable(card, _is_card, f"--to {arguments.to}", "model card")
     trained, network, meta = load_estimator(arguments.folder, arguments.checkpoint)
     position = meta["position"]
     notes = {"dataset": meta["dataset"], "epoch": position["epoch"], "step": position["total"]}
     write_model(arguments.to, trained, network, notes)
-    print(arguments.to)
-    card = arguments.to.with_suffix(".md")
-    with written_whole(card) as temporary:
-        temporary.write_text(_card(arguments.folder, trained, notes, arguments.to.name))
-    print(card)
+    print(arguments.to, save_text(card, _card(arguments.folder, trained, notes, arguments.to.name)), sep="\n")
+
+
+def _is_model(path: Path) -> bool:
+    """Whether travjax wrote a .safetensors file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return "travjax" in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def _is_card(path: Path) -> bool:
+    """Whether a file is a model card of this command."""
+    return PURPOSE in first_lines(path, 3)
 
 
 def _card(folder: Path, trained, notes: dict, name: str) -> str:
@@ -48,7 +68,11 @@ def _card(folder: Path, trained, notes: dict, name: str) -> str:
     preset, tables = trained.preset, folder / "evaluation" / "tables.txt"
     grid, actions, seen = trained.grid, trained.actions, preset.corruption
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
-    measured = tables.read_text().strip() if tables.exists() else "not evaluated: `travjax evaluate` writes the tables"
+    measured = (
+        tables.read_text(encoding="utf-8", errors="replace").strip()
+        if tables.exists()
+        else "not evaluated: `travjax evaluate` writes the tables"
+    )
     field = preset.model == FIELD
     corrupted = (
         f"| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
@@ -57,7 +81,7 @@ def _card(folder: Path, trained, notes: dict, name: str) -> str:
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"
     return f"""# {name}
 
-Predicts which trajectories of a wheeled robot fail on an elevation map, and by which event: step, obstacle, tilt.
+{PURPOSE}
 
 | | |
 |---|---|

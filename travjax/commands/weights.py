@@ -2,12 +2,11 @@
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from travjax.commands import options
 from travjax.config import InputError, require
-from travjax.files import output_folder
+from travjax.files import output_folder, user_path
 
 if TYPE_CHECKING:
     from travjax.imagenet import Weights
@@ -23,7 +22,11 @@ def add(commands: options.Commands) -> None:
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
-        "--from", dest="path", type=Path, metavar="FILE", help=".npz, Keras .h5, .safetensors or .pth file to convert"
+        "--from",
+        dest="path",
+        type=user_path,
+        metavar="FILE",
+        help=".npz, Keras .h5, .safetensors or .pth file to convert",
     )
     source.add_argument(
         "--hub",

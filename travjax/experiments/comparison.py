@@ -13,12 +13,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
-from travjax import bench, curves, metrics, plots
+from travjax import bench, curves, metrics, plots, progress
 from travjax.config import require
 from travjax.experiments import launch, timing
-from travjax.files import output_folder, written_whole
+from travjax.files import output_folder, save_text, user_path
 from travjax.metrics import NAMES, OVERALL
 from travjax.models import FIELD, RESNET
 from travjax.predictor import Predictor
@@ -62,11 +61,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = launch.parser("comparison", DESCRIPTION)
     parser.add_argument(
         "--field",
-        type=Path,
+        type=user_path,
         metavar="C",
         help="folder of a run, or .safetensors file, of a hazard field (the package's)",
     )
-    parser.add_argument("--resnet", type=Path, metavar="RUN", help="folder of a ResNet50's run (left out)")
+    parser.add_argument("--resnet", type=user_path, metavar="RUN", help="folder of a ResNet50's run (left out)")
     parser.add_argument("--maps", type=int, default=200, metavar="N", help="test maps (200)")
     parser.add_argument(
         "--validation-maps", type=int, default=50, metavar="N", help="maps that filters are chosen on (50)"
@@ -85,7 +84,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--seed", type=int, default=SEED, metavar="N", help=f"of maps, corruptions and random trajectories ({SEED})"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("runs/comparison"), metavar="DIR", help="folder to write to (runs/comparison)"
+        "--out",
+        type=user_path,
+        default=Path("runs/comparison"),
+        metavar="DIR",
+        help="folder to write to (runs/comparison)",
     )
     return launch.launch(parser, run, argv)
 
@@ -104,7 +107,7 @@ def run(arguments: argparse.Namespace) -> None:
     counts = {"test": arguments.maps, "validation": arguments.validation_maps}
     grounds = {}
     for number, (what, count) in enumerate(counts.items()):
-        with tqdm(desc=f"{what} maps", total=count, unit="map") as bar:
+        with progress.bar(f"{what} maps", count, "map") as bar:
             named = (trained.robot, trained.actions, trained.grid)
             grounds[what] = Ground.synthetic(count, arguments.seed + number, *named, bar.update)
     results = compare(grounds["test"], grounds["validation"], field, resnet, arguments.samples, arguments.seed)
@@ -125,7 +128,7 @@ def compare(
     results: dict[str, dict] = {}
     chosen = _drawn(test, samples, seed)
     methods = 3 + len(FILTERS) + (resnet is not None)
-    with tqdm(desc="corruptions", total=len(CORRUPTIONS) * methods, unit="method") as bar:
+    with progress.bar("corruptions", len(CORRUPTIONS) * methods, "method") as bar:
         for name in CORRUPTIONS:
             seen = test.seen(name, seed)
             best = validation.best_filter(validation.seen(name, seed + 1), bar.update)
@@ -268,12 +271,10 @@ def _write(
     for title, table in tables.items():
         print(f"\n{title}\n{table}")
     print()
-    with written_whole(out / "results.json") as temporary:
-        text = json.dumps({"maps": metrics.to_json(results), "times": metrics.to_json(rows)}, indent=1, allow_nan=False)
-        temporary.write_text(text + "\n")
-    with written_whole(out / "f1.tsv") as temporary:
-        lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
-        temporary.write_text("\n".join(lines) + "\n")
+    text = json.dumps({"maps": metrics.to_json(results), "times": metrics.to_json(rows)}, indent=1, allow_nan=False)
+    save_text(out / "results.json", text + "\n")
+    lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
+    save_text(out / "f1.tsv", "\n".join(lines) + "\n")
     figures = [plots.save(curves.robustness_figure(f1), out / "robustness.png")]
     seconds = {row["what"]: row["seconds"] for row in rows}
     figures.append(plots.save(curves.quality_figure(_points(f1, seconds)), out / "quality.png"))
