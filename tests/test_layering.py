@@ -10,7 +10,10 @@ import travjax
 ORDER = [
     "config",
     "models",
+    "signals",
+    "locks",
     "files",
+    "progress",
     "grid",
     "batching",
     "noise",

@@ -10,6 +10,8 @@ A folder holds one sub-folder a checkpoint, numbered in the order they were save
 A checkpoint is written to a temporary folder and renamed: a kill at any moment leaves the earlier ones as they were.
 """
 
+import asyncio
+import errno
 import json
 import logging
 import os
@@ -28,10 +30,16 @@ from flax.traverse_util import unflatten_dict
 from jax.experimental import multihost_utils
 
 from travjax.config import InputError, read_json, require
-from travjax.files import sha256
+from travjax.files import sha256, user_path
 
 FORMAT = 1
 UNFINISHED = ".unfinished-checkpoint"
+ENTRIES = 64
+"""Files and folders for which there must be room, a few more than a checkpoint has."""
+
+SPARE = 2**20
+"""Bytes for which there must be room beside those of the arrays."""
+
 NAME = "[a-z][a-z0-9_]*"
 FOLDER = re.compile(rf"(\d{{6,}})-(?:step-\d+(-best)?|({NAME}))")
 PyTree = Any
@@ -46,7 +54,7 @@ class Checkpoints:
 
     def __init__(self, folder: str | Path, keep_latest: int = 2):
         require(isinstance(keep_latest, int) and keep_latest >= 1, "keep_latest", keep_latest, "an integer from 1")
-        self.folder = Path(folder).absolute()
+        self.folder = user_path(folder).absolute()
         self.keep_latest = keep_latest
         self.notices: list[str] = []
         self._damaged: dict[Path, str] = {}
@@ -92,9 +100,10 @@ class Checkpoints:
         def begin() -> None:
             shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was killed
             unfinished.mkdir(parents=True)
+            _require_room(unfinished, sum(leaf.nbytes for leaf in arrays.values()) + len(text))
 
         def write_arrays() -> None:
-            with _quiet_orbax() as ocp:
+            with _quiet_orbax() as ocp, _patient_loops():
                 context = ocp.Context()
                 context.array.saving.use_compression = False  # saves 8 % of the space in seven times the time
                 with context:
@@ -147,7 +156,7 @@ def load_meta(folder: str | Path, which: str = "latest") -> dict:
 
     Raises InputError like `Checkpoints.restore`.
     """
-    return _newest_good(Path(folder).absolute(), which, {}, arrays=False)[1]["meta"]
+    return _newest_good(user_path(folder).absolute(), which, {}, arrays=False)[1]["meta"]
 
 
 def _checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
@@ -273,6 +282,21 @@ def _require_same(path: Path, saved: dict[str, list], wanted: dict[str, list]) -
         raise InputError(f"{path}: other arrays than the network and optimiser have: {'; '.join(each)}{more}")
 
 
+def _require_room(folder: Path, size: int) -> None:
+    """Raises OSError where a checkpoint of so many bytes has no room: Orbax finds out late, after minutes perhaps."""
+    places = [folder / f"room-{number}" for number in range(ENTRIES)]
+    for place in places:
+        place.touch()
+    try:
+        with places[0].open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size + SPARE)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise  # else it is one file of that size that cannot be
+    for place in places:
+        place.unlink()
+
+
 def _reason(error: Exception) -> str:
     """One line. TensorStore reports a full disk and the like as a ValueError that holds the system's error number."""
     if isinstance(error, OSError):
@@ -284,6 +308,38 @@ def _reason(error: Exception) -> str:
 
 def _not_from_orbax(record: logging.LogRecord) -> bool:
     return "orbax" not in Path(record.pathname).parts
+
+
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that ends no earlier than its tasks and threads.
+
+    Orbax closes its own at the first error, while others of its writes are under way: they would go on, each would
+    print a traceback, and what is removed would be made again.
+    """
+
+    def close(self) -> None:
+        if not self.is_closed():
+            self.run_until_complete(self._finish())
+        super().close()
+
+    async def _finish(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        await asyncio.gather(*others, return_exceptions=True)
+        await self.shutdown_default_executor()
+
+
+class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+    _loop_factory = _PatientLoop
+
+
+@contextmanager
+def _patient_loops() -> Iterator[None]:
+    before = asyncio.get_event_loop_policy()
+    asyncio.set_event_loop_policy(_PatientPolicy())
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(before)
 
 
 @contextmanager

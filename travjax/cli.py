@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import travjax
 from travjax.commands import bench, dataset, evaluate, export, label, predict, terrain, train, weights
+from travjax.config import naming
 from travjax.entry import Parser, guarded, use_compilation_cache
 
 COMMANDS = (terrain, label, dataset, weights, train, evaluate, export, predict, bench)
@@ -17,7 +18,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     def work() -> None:
         arguments = _parser().parse_args(argv)
         use_compilation_cache()
-        arguments.run(arguments)
+        with naming(arguments.command):
+            arguments.run(arguments)
 
     return guarded(work)
 
@@ -25,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = Parser(prog="travjax", description="Which trajectories of a wheeled robot will fail, and why.")
     parser.add_argument("--version", action="version", version=f"travjax {travjax.__version__}")
-    commands = parser.add_subparsers(required=True, metavar="COMMAND", parser_class=Parser)
+    commands = parser.add_subparsers(required=True, dest="command", metavar="COMMAND", parser_class=Parser)
     for command in COMMANDS:
         command.add(commands)
     return parser

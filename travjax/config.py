@@ -9,9 +9,11 @@ import dataclasses
 import difflib
 import json
 import math
+import os
 import re
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -79,13 +81,23 @@ def require_length(field: str, value: object, low: float, high: float) -> None:
     require_number(field, value, math.nextafter(low, 0), high, f"a length in metres from {low:g} to {high:g}")
 
 
+@contextmanager
+def naming(what: object) -> Iterator[None]:
+    """Notes on an error for lack of memory what was being read or made; programs say it in their one line."""
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:  # the latter XLA's
+        error.add_note(str(what))
+        raise
+
+
 def load_toml(path: str | Path, kind: type[Config]) -> Config:
     """Reads one configuration dataclass from a TOML file.
 
     Raises InputError that names the file when it is missing or not TOML, when a key is unknown or a field without a
     default is absent, and when the dataclass refuses a value.
     """
-    path = Path(path)
+    path = Path(os.path.expanduser(path))
     table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
     try:
         return kind(**_fields_from(table, kind))

@@ -21,6 +21,7 @@ import numpy as np
 from travjax.actions import ActionSpace
 from travjax.config import (
     InputError,
+    naming,
     one_line,
     parts_from_json,
     read_json,
@@ -29,7 +30,7 @@ from travjax.config import (
     shown,
     to_json,
 )
-from travjax.files import folder_written_whole, sha256
+from travjax.files import folder_written_whole, put_back, sha256, user_path
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
@@ -251,7 +252,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
     on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
     or when it cannot be written: a full disk, no permission.
     """
-    with folder_written_whole(Path(folder), is_dataset) as temporary:
+    with folder_written_whole(user_path(folder), is_dataset) as temporary:
         arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
@@ -264,7 +265,8 @@ def load(folder: str | Path) -> Dataset:
     Raises InputError, which names folder, file and what is wrong, when something is missing, truncated or altered,
     of another format version, or does not fit together.
     """
-    folder = Path(folder)
+    folder = user_path(folder)
+    put_back(folder)
     require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
     path = folder / "dataset.json"
     table = _read_table(path)
@@ -273,7 +275,8 @@ def load(folder: str | Path) -> Dataset:
         _verify(folder / name, size, digest)
     arrays = {name: _read_array(folder / f"{name}.npy") for name in names}
     try:
-        return put_together(table, arrays)
+        with naming(folder):
+            return put_together(table, arrays)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 

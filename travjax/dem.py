@@ -17,7 +17,7 @@ from travjax.array_files import rasters_of, read_npy, read_npz
 from travjax.clouds import read_cloud
 from travjax.config import InputError, require, require_number
 from travjax.dem_options import DemOptions
-from travjax.files import sha256
+from travjax.files import sha256, user_path
 from travjax.formats import unfolded
 from travjax.grid import Grid
 from travjax.memory import require_memory
@@ -132,7 +132,7 @@ def load_dem(
     is none on the ground, has no, a non-square or too large a cell size or not the given one, infinite or absurd
     heights or none at all, is smaller than one window, or does not fit into memory.
     """
-    path = Path(path).expanduser()
+    path = user_path(path)
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
     options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)

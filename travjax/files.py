@@ -1,75 +1,244 @@
-"""Files that are written whole or not at all."""
+"""Files that are written whole or not at all, and the places that a user names.
 
+What is being written lies in a hidden folder beside its place, .travjax-unfinished-XXXXXXXX, which is locked as long as
+its process lives. The next process that writes there removes those of dead ones.
+"""
+
+import ctypes
 import hashlib
 import os
+import re
 import shutil
+import socket
+import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from travjax.config import InputError
+from travjax.locks import lock_file
+
+UNFINISHED = ".travjax-unfinished-"
+LOCK = ".travjax-lock"
+REPLACED = ".travjax-replaced"
+"""Names of ours: of a folder for what is being written; in it, of its lock, and of what is replaced by two renames."""
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A temporary name beside `path` to write to; it becomes `path` when the block ends well, else it is removed.
+    """A temporary path of the same name to write to; it becomes `path` when the block ends well, else it is removed.
 
     Raises InputError when it cannot be written: a full disk, a folder in the way.
     """
-    temporary = path.with_name(f".{os.getpid()}-{path.name}")
-    try:
+    with _input_error(path), _unfinished(path.parent) as unfinished:
+        temporary = unfinished / path.name
         yield temporary
         temporary.replace(path)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def folder_written_whole(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary folder beside `folder` to write to; it becomes `folder` when the block ends well, else it is removed.
+    """A temporary folder to write to; it becomes `folder` when the block ends well, else it is removed.
 
+    At any moment the old or the new one is in its place, where the file system can exchange two names; elsewhere the
+    next process that writes there, or that looks for it by `put_back`, brings back the old one after a kill.
     Raises InputError when it cannot be written, or when a file or a folder that is not `replaceable` lies there.
     """
-    place = folder.resolve()
-    temporary, aside = (place.with_name(f".{os.getpid()}-{mark}{place.name}") for mark in ("", "old-"))
-    try:
-        taken = place.exists() and not (place.is_dir() and (not any(place.iterdir()) or replaceable(place)))
-        if taken:
-            raise InputError(
-                f"{folder}: holds something else: must be a new or empty folder, or an older one of its kind"
-            )
+    place = resolved(folder)
+    with _input_error(folder):
         place.parent.mkdir(parents=True, exist_ok=True)
-        temporary.mkdir()
-        yield temporary
-        if place.exists():
-            place.rename(aside)
-        temporary.rename(place)
+        with _unfinished(place.parent) as unfinished:
+            if place.exists() and not (place.is_dir() and (not any(place.iterdir()) or replaceable(place))):
+                raise InputError(
+                    f"{folder}: holds something else: must be a new or empty folder, or an older one of its kind"
+                )
+            temporary = unfinished / place.name
+            temporary.mkdir()
+            yield temporary
+            if not place.exists() or not _exchanged(temporary, place):
+                if place.exists():
+                    (unfinished / REPLACED).mkdir()
+                    place.rename(unfinished / REPLACED / place.name)
+                temporary.rename(place)
+
+
+def put_back(folder: Path) -> None:
+    """Brings back a folder that a process was replacing when it was killed."""
+    place = resolved(folder)
+    if not place.exists():
+        _remove_remains(place.parent)
+
+
+@contextmanager
+def _input_error(path: Path) -> Iterator[None]:
+    try:
+        yield
     except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from None
+
+
+@contextmanager
+def _unfinished(folder: Path) -> Iterator[Path]:
+    """A hidden folder of this process alone within a folder, for what is being written; it is removed at the end."""
+    _remove_remains(folder)
+    place, lock = _locked_folder(folder)
+    try:
+        yield place
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-        if aside.exists() and not place.exists():
-            aside.rename(place)
-        shutil.rmtree(aside, ignore_errors=True)
+        _bring_back_replaced(place)
+        lock.close()  # network file systems keep open files, and so their folder
+        shutil.rmtree(place, ignore_errors=True)
+
+
+def _locked_folder(folder: Path) -> tuple[Path, IO[str]]:
+    while True:
+        place = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder))
+        try:
+            lock, locked = lock_file(place / LOCK)
+        except FileNotFoundError:  # taken for remains, as yet without a lock, by another process
+            continue
+        except OSError:
+            shutil.rmtree(place, ignore_errors=True)
+            raise
+        if locked is not False:
+            return place, lock
+        lock.close()
+
+
+def _remove_remains(folder: Path) -> None:
+    """Removes from a folder what processes that are dead were writing there."""
+    with suppress(OSError):
+        found = [place for place in folder.iterdir() if re.fullmatch(rf"{re.escape(UNFINISHED)}\w{{8}}", place.name)]
+        for place in found:
+            _remove_if_dead(place)
+
+
+def _remove_if_dead(place: Path) -> None:
+    with suppress(OSError):  # not ours to remove, or removed by another process meanwhile
+        lock, locked = lock_file(place / LOCK)
+        with lock:
+            if locked:
+                _bring_back_replaced(place)
+                shutil.rmtree(place, ignore_errors=True)
+        place.rmdir()  # what network file systems had kept
+
+
+def _bring_back_replaced(unfinished: Path) -> None:
+    """Moves a folder whose place was to be taken back, where nothing has taken it."""
+    with suppress(OSError):
+        for old in (unfinished / REPLACED).iterdir():
+            if not os.path.lexists(unfinished.parent / old.name):
+                old.rename(unfinished.parent / old.name)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    """Exchanges two names at once, and returns whether the system and the file system can."""
+    here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of Linux
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (OSError, AttributeError):
+        return False
+    return rename(here, os.fsencode(one), here, os.fsencode(other), exchange) == 0
+
+
+_HELD: set[Path] = set()
+"""Folders that this process holds."""
+
+
+@contextmanager
+def held(folder: Path, option: str = "--out") -> Iterator[None]:
+    """Keeps a folder, which is made if need be, for this process while the block runs; it may do so within as well.
+
+    option: what a message calls the folder
+    Raises InputError that names process and host when another process keeps it, or when it cannot be written to.
+    """
+    place = resolved(folder)
+    if place in _HELD:
+        yield
+        return
+    new = not place.exists()
+    path = output_folder(folder) / LOCK
+    try:
+        with _input_error(path):
+            lock, locked = lock_file(path)
+        with lock:
+            if locked is False:
+                raise InputError(
+                    f"{option} {folder}: in use by {_holder(lock)}; allowed: a folder that no other run uses"
+                )
+            with suppress(OSError):  # a full disk is reported by what is written next
+                lock.truncate(0)
+                lock.write(f"process {os.getpid()} on {socket.gethostname()}")
+                lock.flush()
+            _HELD.add(place)
+            try:
+                yield
+            finally:
+                _HELD.remove(place)
+                path.unlink(missing_ok=True)
+    finally:
+        if new:
+            with suppress(OSError):  # it holds something
+                place.rmdir()
+
+
+def _holder(lock: IO[str]) -> str:
+    lock.seek(0)
+    return lock.read(200).strip() or "another process"
 
 
 def output_folder(path: str | Path) -> Path:
-    """Creates the folder if need be. Raises InputError when it cannot be written to."""
-    folder = Path(path)
+    """Creates the folder if need be, and removes what processes that are dead were writing there.
+
+    Raises InputError when it cannot be written to.
+    """
+    folder = user_path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        probe = folder / f".{os.getpid()}-probe"
-        probe.touch()
-        probe.unlink()
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise InputError(
             f"--out {folder}: cannot be written: {error.strerror}; allowed: a folder you may write to"
         ) from None
+    _remove_remains(folder)
     return folder
+
+
+def require_replaceable(path: Path, ours: Callable[[Path], bool], option: str, what: str) -> None:
+    """Refuses to replace a file that nobody named and that is not `ours`.
+
+    option: what led to its name, and its value; what: what would be written
+    Raises InputError.
+    """
+    if os.path.lexists(path) and not (path.is_file() and ours(path)):
+        raise InputError(
+            f"{option}: {path} is in the way, and no {what} of travjax; allowed: another name, or none there"
+        )
+
+
+def first_lines(path: Path, count: int) -> list[str]:
+    """The first lines of a text file, fewer if it has no more; none if it cannot be read."""
+    try:
+        with path.open(encoding="utf-8", errors="replace") as file:
+            return [file.readline(1000).rstrip("\n") for _ in range(count)]
+    except OSError:
+        return []
+
+
+def user_path(path: str | Path) -> Path:
+    """The path that a user gives, with their home for ~; without a home it stays as it is."""
+    return Path(os.path.expanduser(path))
+
+
+def resolved(path: Path) -> Path:
+    """The path without symbolic links. Raises InputError when one of them leads to itself."""
+    try:
+        return path.resolve()
+    except (OSError, RuntimeError):  # the latter up to Python 3.12
+        raise InputError(f"{path}: a symbolic link that leads to itself; allowed: a folder, or a new one") from None
 
 
 def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX_DATA") -> Path:
@@ -78,7 +247,7 @@ def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX
     Raises InputError that says what it is, where it was looked for, and what is allowed.
     """
     data = os.environ.get("TRAVJAX_DATA")
-    for place in [Path(name)] + ([Path(data) / name] if data else []):
+    for place in [user_path(name)] + ([user_path(data) / name] if data else []):
         if place.is_file():
             return place
     where = f"nor under TRAVJAX_DATA={data}" if data else "and TRAVJAX_DATA is not set"
@@ -91,8 +260,8 @@ def find_preset(given: str, experiment: str) -> Path:
     Raises InputError that lists the names when there is no such file.
     """
     if Path(given).suffix == ".toml":
-        if Path(given).is_file():
-            return Path(given)
+        if user_path(given).is_file():
+            return user_path(given)
         raise InputError(f"preset {given}: no such file")
     folder = Path("experiments") / experiment
     path = folder / f"{given}.toml"
@@ -110,9 +279,19 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def cache_folder() -> Path:
-    """Where the user's machine keeps what can be made again."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "travjax"
+def cache_folder() -> Path | None:
+    """Where the user's machine keeps what can be made again; None for a user without a home."""
+    home = os.path.expanduser("~") if os.environ.get("HOME") != "" else ""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    place = given if os.path.isabs(given) else os.path.join(home, ".cache")  # the standard has relative ones ignored
+    return Path(place) / "travjax" if os.path.isabs(place) else None
+
+
+def save_text(path: Path, text: str) -> Path:
+    """Writes a text file, whole or not at all; what UTF-8 has no letter for, as in names of files, is escaped."""
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+    return path
 
 
 def save_npz(path: Path, **arrays) -> Path:

@@ -20,6 +20,7 @@ from flax import nnx
 from tabulate import tabulate
 
 from travjax.config import InputError, require
+from travjax.files import user_path
 from travjax.namings import CLASSES, Recognised, recognised
 from travjax.namings import NAMINGS as _NAMINGS
 from travjax.preprocessing import INPUTS, converted, has_statistics, require_fit, require_statistics
@@ -84,7 +85,7 @@ def load_weights(
     show that they are made for another input, or its arrays do not fit: missing, unexpected, of a wrong shape, no
     floating-point numbers, not finite, a negative variance. All of those are in one error.
     """
-    path = Path(path)
+    path = user_path(path)
     try:
         require(input is None or input in INPUTS, "input", input, f"one of {', '.join(INPUTS)}")
         with open_arrays(path) as file:
@@ -216,7 +217,7 @@ def apply_weights(resnet: ResNet, weights: Weights) -> None:
 def save_safetensors(weights: Weights, path: str | Path) -> None:
     """Writes canonical names and arrays to a file that load_weights reads back, whole or not at all."""
     notes = {key: getattr(weights, key) for key in ("origin", "stride_in", "epsilon")}
-    write_safetensors(Path(path), weights.arrays, notes)
+    write_safetensors(user_path(path), weights.arrays, notes)
 
 
 def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:

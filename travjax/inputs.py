@@ -12,6 +12,7 @@ import hashlib
 import zipfile
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -163,13 +164,13 @@ def trajectory_bank(
     """Channels 2 and 3 of every trajectory: 101 MB for the paper's action space.
 
     cache: folder that keeps it, one file a configuration (the user's cache unless given); a damaged file is made anew,
-           and a folder that cannot be written to is done without
+           and a folder that cannot be written to, or a user without a cache, is done without
     on_progress: is told how many trajectories were added
     """
     configuration = repr((FORMAT, robot.track, robot.wheelbase, robot.wheel_width, actions, grid))
     name = f"bank-{hashlib.sha256(configuration.encode()).hexdigest()[:16]}.npz"
-    path = (cache_folder() if cache is None else cache) / name
-    bank = _read_bank(path, configuration)
+    folder = cache_folder() if cache is None else cache
+    bank = _read_bank(folder / name, configuration) if folder else None
     if bank is not None:
         on_progress(len(actions))
         return bank
@@ -179,11 +180,10 @@ def trajectory_bank(
         numbers = np.arange(start, start + block)
         bank[numbers] = trajectory_channels(robot, actions, grid, numbers)
         on_progress(block)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_npz(path, bank=bank, configuration=configuration)
-    except (InputError, OSError):
-        pass  # it is made again the next time
+    if folder:
+        with suppress(InputError, OSError):  # it is made again the next time
+            folder.mkdir(parents=True, exist_ok=True)
+            save_npz(folder / name, bank=bank, configuration=configuration)
     return bank
 
 

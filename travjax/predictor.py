@@ -10,6 +10,7 @@ from jaxtyping import Float
 from travjax.actions import ActionSpace
 from travjax.config import InputError, require
 from travjax.estimator import take_apart
+from travjax.files import user_path
 from travjax.grid import Grid
 from travjax.map_data import MapSource
 from travjax.model_file import SUFFIX, read_model
@@ -60,7 +61,7 @@ class Predictor:
         which: checkpoint of a folder
         Raises InputError when there is none, or it is damaged.
         """
-        path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else Path(source)
+        path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else user_path(source)
         if path.is_dir():
             return Predictor(*load_estimator(path, which)[:2])
         if path.suffix != SUFFIX:

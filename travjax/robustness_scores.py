@@ -4,9 +4,8 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from tqdm import tqdm
 
-from travjax import metrics
+from travjax import metrics, progress
 from travjax.metrics import NAMES, OVERALL, Confusion
 from travjax.predictor import Predicted, Predictor
 from travjax.report import rows_table
@@ -49,7 +48,7 @@ SiteScores = dict[str, dict[str, dict[str, Confusion]]]
 
 def best_filters(validation: Ground, seed: int) -> dict[str, str]:
     """For every corruption the filter of FILTERS after which the simulator is best on the validation maps."""
-    with tqdm(desc="filters", total=len(CORRUPTIONS) * len(FILTERS), unit="filter") as bar:
+    with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
         return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
 
 
@@ -66,7 +65,7 @@ def compare(
     results: dict[str, dict] = {}
     drawn = _drawn(test, samples, seed)
     methods = 3 + (resnet is not None)
-    with tqdm(desc="corruptions", total=len(CORRUPTIONS) * methods, unit="method") as bar:
+    with progress.bar("corruptions", len(CORRUPTIONS) * methods, "method") as bar:
         for name in CORRUPTIONS:
             seen = test.seen(name, seed)
             predicted = field.predict(seen)
@@ -119,7 +118,7 @@ def _on_clean_maps(test: Ground, validation: Ground, field: Predictor, predicted
 
 def on_sites(real: Mapping[str, Ground], field: Predictor, seed: int) -> dict[str, SiteScores]:
     """For every site and corruption: the confusions of the simulator after each filter, and of the hazard field."""
-    with tqdm(desc="sites", total=len(real) * len(CORRUPTIONS) * len(ON_SITES), unit="method") as bar:
+    with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
         return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from travjax.config import InputError, one_line, parse_json
-from travjax.files import written_whole
+from travjax.files import save_text
 
 
 class RunLog:
@@ -23,8 +23,7 @@ class RunLog:
 
         self.path = folder / "metrics.jsonl"
         kept = [row for row in read_rows(self.path) if row["step"] <= step] if step else []
-        with written_whole(self.path) as temporary:
-            temporary.write_text("".join(f"{json.dumps(row)}\n" for row in kept))
+        save_text(self.path, "".join(f"{json.dumps(row)}\n" for row in kept))
         board = folder / "tensorboard"
         try:
             board.mkdir(exist_ok=True)

@@ -21,7 +21,7 @@ import numpy as np
 
 from travjax.config import InputError, require
 from travjax.dataset import SPLITS, Dataset, configs_to_json, put_together
-from travjax.files import folder_written_whole
+from travjax.files import folder_written_whole, put_back, user_path
 
 NAME, VERSION = "travjax", "1.0.0"
 
@@ -45,7 +45,7 @@ def export(dataset: Dataset, folder: str | Path, on_progress: Callable[[int], ob
     when tensorflow-datasets is missing, when something else lies there, or when it cannot be written.
     """
     tfds = _tensorflow_datasets()
-    with folder_written_whole(Path(folder), _is_export) as temporary:
+    with folder_written_whole(user_path(folder), _is_export) as temporary:
         builder = _builder_class(tfds, dataset, on_progress)(data_dir=temporary, file_format="array_record")
         downloads, no_bucket = temporary / "downloads", tfds.download.DownloadConfig(try_download_gcs=False)
         tfds.disable_progress_bar()
@@ -64,8 +64,10 @@ def read(folder: str | Path) -> Dataset:
     Raises InputError when tensorflow-datasets is missing, when there is no such data set, or when it is damaged.
     """
     tfds = _tensorflow_datasets()
-    place = Path(folder) / NAME / VERSION
-    require(_is_export(Path(folder)), "folder", str(folder), f"one with an exported data set in {NAME}/{VERSION}")
+    folder = user_path(folder)
+    put_back(folder)
+    place = folder / NAME / VERSION
+    require(_is_export(folder), "folder", str(folder), f"one with an exported data set in {NAME}/{VERSION}")
     try:
         builder = tfds.builder_from_directory(place)
         return put_together(builder.info.metadata, _collected(builder))

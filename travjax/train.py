@@ -9,6 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +18,13 @@ from typing import Any
 import jax
 import numpy as np
 import optax
-from tqdm import tqdm
 
-from travjax import metrics
+from travjax import metrics, progress
 from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import VARIABLES, take_apart
+from travjax.files import held
 from travjax.inputs import ImageSource
 from travjax.map_data import MapSource
 from travjax.parallel import Devices
@@ -132,8 +133,13 @@ class Trainer:
     def train(self) -> None:
         """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
 
-        Raises InputError when the loss is no number any more; the last checkpoint is kept.
+        Raises InputError when another process works in the folder, and when the loss is no number any more; the last
+        checkpoint is kept.
         """
+        with held(self.folder) if self.devices.main else nullcontext():
+            self._train()
+
+    def _train(self) -> None:
         if self.devices.main:
             self.log = RunLog(self.folder, self.position.total)
         try:
@@ -227,7 +233,7 @@ class Trainer:
         )
         return loss
 
-    def _count(self, loss: jax.Array, samples: float, number: int, bar: tqdm) -> None:
+    def _count(self, loss: jax.Array, samples: float, number: int, bar: progress.Bar) -> None:
         """Adds a batch to the epoch's sums."""
         here, value = self.position, float(loss)
         if not math.isfinite(value):
@@ -314,12 +320,12 @@ class Trainer:
         if self.log:
             self.log.write(place | row)
 
-    def _bar(self, what: str, total: int, unit: str = "sample", initial: int = 0) -> tqdm:
-        return tqdm(desc=what, total=total, initial=initial, unit=unit, disable=self.quiet, leave=False)
+    def _bar(self, what: str, total: int, unit: str = "sample", initial: int = 0) -> progress.Bar:
+        return progress.bar(what, total, unit, self.quiet, initial=initial, leave=False)
 
     def _say(self, text: str) -> None:
         if not self.quiet:
-            tqdm.write(text)
+            progress.say(text)
 
 
 def _summary(here: Position, row: dict[str, Any], best: bool) -> str:

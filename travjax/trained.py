@@ -19,7 +19,7 @@ from travjax.checkpoint import Checkpoints
 from travjax.config import InputError, one_line, parts_from_json, read_json, require, shown, to_json
 from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
 from travjax.field import HazardField
-from travjax.files import written_whole
+from travjax.files import save_text, user_path
 from travjax.grid import Grid
 from travjax.imagenet import Weights
 from travjax.inputs import ImageSource
@@ -59,10 +59,7 @@ class Run:
 
     def save(self, folder: Path) -> Path:
         """Writes run.json."""
-        path = folder / "run.json"
-        with written_whole(path) as temporary:
-            temporary.write_text(json.dumps(self.to_json(), indent=1) + "\n")
-        return path
+        return save_text(folder / "run.json", json.dumps(self.to_json(), indent=1) + "\n")
 
     def to_json(self) -> dict[str, Any]:
         """What JSON can hold."""
@@ -76,7 +73,7 @@ class Run:
     @staticmethod
     def load(folder: str | Path) -> "Run":
         """Reads run.json; raises InputError when it is missing or wrong."""
-        path = Path(folder) / "run.json"
+        path = user_path(folder) / "run.json"
         table = read_json(path, "the folder of a training run")
         try:
             return Run.from_json(table)
@@ -162,7 +159,7 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     Raises InputError when there is none, it is damaged, or a number of it is not finite.
     """
     run = Run.load(folder)
-    checkpoints = Checkpoints(Path(folder) / "checkpoints")
+    checkpoints = Checkpoints(user_path(folder) / "checkpoints")
     state, meta = checkpoints.restore(lambda meta: run.template(checked_meta(meta, folder)["optimizer"]), which)
     for notice in checkpoints.notices:
         print(one_line(notice))

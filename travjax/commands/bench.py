@@ -4,9 +4,8 @@ import argparse
 from pathlib import Path
 
 import jax
-from tqdm import tqdm
 
-from travjax import report
+from travjax import progress, report
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import require
@@ -50,7 +49,7 @@ def _measure_network(arguments: argparse.Namespace, robot: Robot, actions: Actio
 
     out = output_folder(arguments.out)
     rows = bench_network.Bench(robot, actions, grid, arguments.repeats).rows()
-    measured = bench_network.with_ratio(list(tqdm(rows, "network", total=4)))
+    measured = bench_network.with_ratio(list(progress.bar("network", 4, "row", iterable=rows)))
     _write(measured, bench_network.COLUMNS, out / "network.tsv")
 
 
@@ -74,11 +73,11 @@ def _measure_labelling(arguments: argparse.Namespace, robot: Robot, actions: Act
     # First calls are to compile, not to read the cache.
     jax.config.update("jax_enable_compilation_cache", False)
     measured = bench.kernel_rows(robot, actions, grid, arguments.repeats)
-    rows += list(tqdm(measured, "kernels", total=2 * len(bench.BATCHES)))
-    with tqdm(desc="sequential simulator", total=len(actions), unit="trajectory") as bar:
+    rows += list(progress.bar("kernels", 2 * len(bench.BATCHES), "row", iterable=measured))
+    with progress.bar("sequential simulator", len(actions), "trajectory") as bar:
         rows.append(bench.reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
     if arguments.stream:
-        with tqdm(desc="stream", total=arguments.stream, unit="map") as bar:
+        with progress.bar("stream", arguments.stream, "map") as bar:
             rows.append(bench.stream_row(arguments.stream, robot, actions, grid, bar.update))
     rows = bench.with_speed_up(rows)
     _write(rows, bench.COLUMNS, out / "bench.tsv")

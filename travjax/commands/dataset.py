@@ -6,19 +6,17 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from travjax import sites, tfds_builder, traverse
+from travjax import progress, sites, tfds_builder, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
 from travjax.dem_options import DemOptions
-from travjax.files import output_folder, written_whole
+from travjax.files import first_lines, output_folder, put_back, require_replaceable, resolved, save_text, user_path
 from travjax.grid import Grid
 from travjax.provenance import SIDES, Site, SitesConfig, Strip
 from travjax.robot import Robot
-from travjax.statistics import statistics_table, windows_table
+from travjax.statistics import COLUMNS, statistics_table, windows_table
 
 SYNTHETIC = ("maps", "seed", "validation", "test", "world")
 """The options of a synthetic data set."""
@@ -55,10 +53,10 @@ def add(commands: options.Commands) -> None:
     options.add_grid(parser)
     options.add_out(parser, "runs/dataset")
     parser.add_argument(
-        "--check", type=Path, metavar="DIR", help="make nothing: verify the data set in DIR and show what it holds"
+        "--check", type=user_path, metavar="DIR", help="make nothing: verify the data set in DIR and show what it holds"
     )
     parser.add_argument(
-        "--tfds", type=Path, metavar="DIR", help="also write the data set for tensorflow-datasets, as array_record"
+        "--tfds", type=user_path, metavar="DIR", help="also write the data set for tensorflow-datasets, as array_record"
     )
     parser.set_defaults(run=run, making={name: parser.get_default(name) for name in MAKING})
 
@@ -66,7 +64,7 @@ def add(commands: options.Commands) -> None:
 def _add_real(parser: argparse.ArgumentParser) -> None:
     config = SitesConfig((Site("none"),))
     parser.add_argument(
-        "--sites", type=Path, metavar="FILE", help="real maps: .toml file with a [[site]] for each elevation map"
+        "--sites", type=user_path, metavar="FILE", help="real maps: .toml file with a [[site]] for each elevation map"
     )
     parser.add_argument("--dem", nargs="+", default=[], metavar="FILE", help="real maps: elevation maps to train on")
     parser.add_argument(
@@ -97,24 +95,29 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Makes and saves a data set or checks one, prints what it holds, and exports it if that is asked for."""
     folder = arguments.check or arguments.out
+    statistics = folder.with_name(f"{folder.name}_statistics.txt")  # the folder holds the data set alone
     if arguments.check:
         _require_left_out(arguments, MAKING, "--check is given")
+    else:
+        require_replaceable(statistics, _are_statistics, f"--out {folder}", "table")
     if arguments.tfds:
-        outside = not arguments.tfds.resolve().is_relative_to(folder.resolve())
+        outside = not resolved(arguments.tfds).is_relative_to(resolved(folder))
         require(outside, "--tfds", str(arguments.tfds), f"a folder outside the data set, {folder}")
     dataset = load(folder) if arguments.check else _made(arguments, folder)
     tables = _print_tables(dataset)
     if arguments.check:
         print(f"{folder}: all files are as they were written")
     else:
-        statistics = folder.with_name(f"{folder.name}_statistics.txt")  # the folder holds the data set alone
-        with written_whole(statistics) as temporary:
-            temporary.write_text("\n\n".join(tables) + "\n")
-        print(folder, statistics, sep="\n")
+        print(folder, save_text(statistics, "\n\n".join(tables) + "\n"), sep="\n")
     if arguments.tfds:
-        with tqdm(desc="exporting", total=len(dataset.split), unit="map") as bar:
+        with progress.bar("exporting", len(dataset.split), "map") as bar:
             tfds_builder.export(dataset, arguments.tfds, bar.update)
         print(arguments.tfds)
+
+
+def _are_statistics(path: Path) -> bool:
+    """Whether a file holds the tables of a data set: their first line is that of the headings."""
+    return [line.split() for line in first_lines(path, 1)] == [" ".join(COLUMNS.values()).split()]
 
 
 def _print_tables(dataset: Dataset) -> list[str]:
@@ -202,12 +205,12 @@ def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path,
     """What `make` makes; `total` maps, if that is known before."""
     _require_free(folder)
     try:
-        with tqdm(desc="making", total=total, unit="map", delay=0.1) as bar:  # none where a file is refused at once
+        with progress.bar("making", total, "map", delay=0.1) as bar:  # none where a file is refused at once
             dataset = make(bar.update)
     except MemoryError as error:
         raise InputError(f"{what}: do not fit in memory: {error}") from None
     size = sum(array.nbytes for array in dataset.arrays.values())
-    with tqdm(desc="saving", total=size, unit="B", unit_scale=True) as bar:
+    with progress.bar("saving", size, "B", unit_scale=True) as bar:
         # The files' headers are not in the total.
         save(dataset, folder, lambda added: bar.update(min(added, size - bar.n)))
     return dataset
@@ -215,7 +218,8 @@ def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path,
 
 def _require_free(folder: Path) -> None:
     """Refuses, before minutes of work, what `save` would refuse after them, and to replace the working folder."""
-    require(folder.resolve() != Path.cwd(), "--out", str(folder), "another folder than the one you are in")
+    require(resolved(folder) != Path.cwd(), "--out", str(folder), "another folder than the one you are in")
+    put_back(folder)
     try:
         empty = not folder.exists() or folder.is_dir() and not any(folder.iterdir())
     except OSError as error:
@@ -223,5 +227,5 @@ def _require_free(folder: Path) -> None:
     if not empty and not is_dataset(folder):
         raise InputError(f"--out {folder}: holds something else: must be a new or empty folder, or that of a data set")
     if not empty:
-        tqdm.write(f"{folder}: the data set there will be replaced")
+        progress.say(f"{folder}: the data set there will be replaced")
     output_folder(folder.parent)

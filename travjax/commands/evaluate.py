@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
+from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, one_line, require
-from travjax.files import output_folder, written_whole
+from travjax.files import output_folder, save_text, user_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -38,8 +38,8 @@ def add(commands: options.Commands) -> None:
         description="Evaluates a training run's estimator on the test maps of its data set: the paper's table beside "
         "ours, thresholds for a wanted recall, calibration, failures by style, and figures.",
     )
-    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a training run")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="data set (the run's own)")
+    parser.add_argument("folder", type=user_path, metavar="RUN", help="folder of a training run")
+    parser.add_argument("--data", type=user_path, metavar="DIR", help="data set (the run's own)")
     parser.add_argument(
         "--checkpoint", default="best", metavar="C", help="best, latest, or heads for the end of phase 1 (best)"
     )
@@ -52,7 +52,7 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("--no-baselines", action="store_true", help="without the two predictors to beat")
     parser.add_argument(
         "--out",
-        type=Path,
+        type=user_path,
         metavar="DIR",
         help="folder to write to (RUN/evaluation, and RUN/evaluation_C for another checkpoint than best)",
     )
@@ -118,7 +118,7 @@ def evaluate(
     description = _description(evaluator, samples, checkpoint, meta["position"])
     errors = None
     if isinstance(estimator, HazardField):
-        with tqdm(desc="margins", total=len(np.unique(samples[0])), unit="map") as bar:
+        with progress.bar("margins", len(np.unique(samples[0])), "map") as bar:
             predicted, true = evaluator.margins(estimator, samples, bar.update)
         errors = np.abs(predicted - true).mean(axis=0) * np.asarray(trained.robot.limits)
         others[MARGINS] = evaluator.scores(np.clip(predicted / 2, 0, 1), samples, recalls)  # 0.5 is the limit
@@ -128,7 +128,7 @@ def evaluate(
 
 
 def _probabilities(evaluator: "Evaluator", estimator: "Network", samples: "Samples", what: str) -> np.ndarray:
-    with tqdm(desc=what, total=len(samples[0]), unit="sample") as bar:
+    with progress.bar(what, len(samples[0]), "sample") as bar:
         return evaluator.probabilities(estimator, samples, bar.update)
 
 
@@ -143,7 +143,7 @@ def _baselines(
         try:
             heads = load_estimator(folder, "heads")[1]
         except InputError as error:
-            tqdm.write(f"{error}; left out")
+            progress.say(f"{error}; left out")
         else:
             others["heads on the frozen trunk"] = _probabilities(evaluator, heads, samples, "frozen trunk")
     others["regression on slope and step"] = evaluator.regression(samples)
@@ -198,9 +198,7 @@ def _write_tables(
     if errors is not None:
         results["margin_errors"] = dict(zip(EVENTS, errors.tolist(), strict=True))
     for name, content in (("tables.txt", text), ("evaluation.json", json.dumps(results, indent=1, allow_nan=False))):
-        with written_whole(out / name) as temporary:
-            temporary.write_text(content + "\n")
-        print(out / name)
+        print(save_text(out / name, content + "\n"))
 
 
 def _margin_errors(errors: np.ndarray) -> str:
@@ -244,7 +242,7 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, sample
     shown = evaluator.to_show(maps)
     every = evaluator.every(len(shown), samples)
     labels = data.labels[shown, ::every]
-    with tqdm(desc="maps for the figure", total=labels.size, unit="sample") as bar:
+    with progress.bar("maps for the figure", labels.size, "sample") as bar:
         probability = evaluator.whole_maps(estimator, shown, bar.update, every)
     failed, known = map(np.asarray, unpacked(labels))
     titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]

@@ -6,11 +6,16 @@ from typing import TYPE_CHECKING
 
 from travjax.commands import options
 from travjax.config import InputError, read_text
-from travjax.files import written_whole
+from travjax.files import first_lines, require_replaceable, save_text, user_path
 from travjax.models import FIELD
 
 if TYPE_CHECKING:
     from travjax.trained import Run
+
+PURPOSE = (
+    "Predicts which trajectories of a wheeled robot fail on an elevation map, and by which event: step, obstacle, tilt."
+)
+"""The sentence after the title of a card."""
 
 
 def add(commands: options.Commands) -> None:
@@ -21,9 +26,9 @@ def add(commands: options.Commands) -> None:
         description="Writes the estimator of a training run to one .safetensors file, which `travjax predict "
         "--checkpoint` takes, and beside it a model card: what it was trained on, and the tables of its evaluation.",
     )
-    parser.add_argument("folder", type=Path, metavar="RUN", help="folder of a training run")
+    parser.add_argument("folder", type=user_path, metavar="RUN", help="folder of a training run")
     parser.add_argument("--checkpoint", default="best", metavar="C", help="best or latest (best)")
-    parser.add_argument("--to", type=Path, required=True, metavar="FILE", help=".safetensors file to write")
+    parser.add_argument("--to", type=user_path, required=True, metavar="FILE", help=".safetensors file to write")
     parser.set_defaults(run=run)
 
 
@@ -34,16 +39,31 @@ def run(arguments: argparse.Namespace) -> None:
 
     if arguments.to.suffix != SUFFIX:
         raise InputError(f"--to {arguments.to}: must be a {SUFFIX} file")
+    beside = arguments.to.with_suffix(".md")
+    require_replaceable(arguments.to, _is_model, f"--to {arguments.to}", "estimator")
+    require_replaceable(beside, _is_card, f"--to {arguments.to}", "model card")
     trained, network, meta = load_estimator(arguments.folder, arguments.checkpoint)
     position = meta["position"]
     notes = {"dataset": meta["dataset"], "epoch": position["epoch"], "step": position["total"]}
     write_model(arguments.to, trained, network, notes)
-    print(arguments.to)
-    path = arguments.to.with_suffix(".md")
     tables, real = (_text(arguments.folder / name) for name in ("evaluation/tables.txt", "comparison/sites.txt"))
-    with written_whole(path) as temporary:
-        temporary.write_text(card(trained, notes, arguments.to.name, tables, real))
-    print(path)
+    print(arguments.to, save_text(beside, card(trained, notes, arguments.to.name, tables, real)), sep="\n")
+
+
+def _is_model(path: Path) -> bool:
+    """Whether travjax wrote a .safetensors file."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="np") as file:
+            return "travjax" in (file.metadata() or {})
+    except (SafetensorError, OSError):
+        return False
+
+
+def _is_card(path: Path) -> bool:
+    """Whether a file is a model card of this command."""
+    return PURPOSE in first_lines(path, 3)
 
 
 def _text(path: Path) -> str | None:
@@ -72,7 +92,7 @@ def card(trained: "Run", notes: dict, name: str, tables: str | None, real: str |
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"
     return f"""# {name}
 
-Predicts which trajectories of a wheeled robot fail on an elevation map, and by which event: step, obstacle, tilt.
+{PURPOSE}
 
 | | |
 |---|---|

@@ -12,7 +12,7 @@ from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import one_line, require
 from travjax.dem import load_dem
-from travjax.files import output_folder, written_whole
+from travjax.files import output_folder, save_text, user_path
 from travjax.formats import OTHERS
 from travjax.grid import Grid
 from travjax.labelling import Batch, bytes_each, dem_batches, labelled, samples, synthetic_batches, title
@@ -29,7 +29,9 @@ def add(commands: options.Commands) -> None:
         description="Labels every trajectory of maps with step, obstacle and tilt failures: of synthetic maps, or of "
         f"the windows of elevation maps: GeoTIFF and other rasters of local pixels that GDAL reads, {OTHERS}.",
     )
-    parser.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
+    parser.add_argument(
+        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
+    )
     options.add_synthetic(parser, count=200, each="maps in all, the styles in turn")
     options.add_dem(parser, stride=8.0)
     options.add_robot(parser)
@@ -53,13 +55,12 @@ def run(arguments: argparse.Namespace) -> None:
         maps = labels.arrays
         table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
         labels.save(config=config, cell_size=grid.spacing)
-        with written_whole(out / "shares.txt") as temporary:
-            temporary.write_text(table + "\n")
+        shares = save_text(out / "shares.txt", table + "\n")
         print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
         unknown = int((~maps["known"].any(axis=-1)).sum())
         if unknown:
             print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
-        print(labels.path, out / "shares.txt", sep="\n")
+        print(labels.path, shares, sep="\n")
         if not arguments.no_figures:
             _write_figures(maps, robot, actions, grid, out)
 

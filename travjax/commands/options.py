@@ -8,14 +8,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from travjax.actions import ActionSpace
 from travjax.config import InputError, require, to_json
 from travjax.dem_options import AXES_UP, DemOptions
+from travjax.files import user_path
 from travjax.footprint import node_table
 from travjax.grid import Grid
 from travjax.labelling import Batch
+from travjax.progress import bar
 from travjax.robot import Robot
 from travjax.terrain import STYLES, require_world
 
@@ -49,7 +49,7 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     """Robot and action space; see `configuration`."""
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
-    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
 
 
 GROWS = "features of synthetic maps grow with it, unless a world is given"
@@ -117,7 +117,9 @@ def _codes(text: str) -> tuple[int, ...]:
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
     """The folder to write to."""
-    parser.add_argument("--out", type=Path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})")
+    parser.add_argument(
+        "--out", type=user_path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})"
+    )
 
 
 def count(arguments: argparse.Namespace) -> int:
@@ -182,7 +184,7 @@ def configuration_json(robot: Robot, actions: ActionSpace, grid: Grid, **more: A
 
 def progress(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]:
     """The batches, with a bar that counts their maps."""
-    with tqdm(desc=what, total=total, unit="map") as bar:
+    with bar(what, total, "map") as shown:
         for batch in batches:
             yield batch
-            bar.update(len(batch["heights"]))
+            shown.update(len(batch["heights"]))

@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-from tqdm import tqdm
 
+from travjax import progress
 from travjax.commands import label, options
 from travjax.config import require
-from travjax.files import output_folder, save_npz, written_whole
+from travjax.files import output_folder, save_npz, save_text, user_path
 from travjax.labelling import Batch, joined, labelled, samples, title
 from travjax.models import MODELS
 
@@ -31,9 +31,14 @@ def add(commands: options.Commands) -> None:
         "windows of elevation maps as `travjax label` takes them, or of synthetic maps. The estimator is the hazard "
         "field for the Seekur Jr that comes with the package, unless another is named.",
     )
-    parser.add_argument("dem", nargs="*", type=Path, metavar="DEM", help="elevation map files; none: synthetic maps")
     parser.add_argument(
-        "--checkpoint", type=Path, metavar="C", help="folder of a training run, or .safetensors file of an estimator"
+        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
+    )
+    parser.add_argument(
+        "--checkpoint",
+        type=user_path,
+        metavar="C",
+        help="folder of a training run, or .safetensors file of an estimator",
     )
     parser.add_argument("--model", choices=MODELS, help="what the estimator must be")
     parser.add_argument("--robot", metavar="R", help="what the estimator must have been trained for")
@@ -62,7 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
     total, source, files = label.maps_of(arguments, trained.grid)
     out = output_folder(arguments.out)
     maps = joined(list(options.progress((_simulated(batch, predictor) for batch in source), total, "simulator")))
-    with tqdm(desc="predicting", total=total * len(trained.actions), unit="trajectory") as bar:
+    with progress.bar("predicting", total * len(trained.actions), "trajectory") as bar:
         predicted = predictor.predict(maps["heights"], bar.update)
     fails = predicted.probability >= PROBABILITY
     table = report.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
@@ -80,9 +85,8 @@ def run(arguments: argparse.Namespace) -> None:
         trained.robot, trained.actions, trained.grid, files=files, model=model, world=arguments.world
     )
     saved = save_npz(out / "predictions.npz", config=config, cell_size=trained.grid.spacing, **arrays)
-    with written_whole(out / "shares.txt") as temporary:
-        temporary.write_text(text + "\n")
-    print(f"\n{text}\n\n{saved}\n{out / 'shares.txt'}")
+    shares = save_text(out / "shares.txt", f"{text}\n")
+    print(f"\n{text}\n\n{saved}\n{shares}")
     if not arguments.no_figures:
         print(_figure(maps, predicted.probability, predictor, arguments.check, out))
 

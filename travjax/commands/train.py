@@ -1,16 +1,17 @@
 """`travjax train`: trains the estimator from a preset, and goes on with a run that was interrupted."""
 
 import argparse
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tqdm import tqdm
-
+from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, one_line, require
-from travjax.files import find_preset, output_folder
+from travjax.files import find_preset, held, output_folder, put_back, user_path
 from travjax.models import FOLDERS, MODELS, RESNET
+from travjax.signals import going_on
 
 if TYPE_CHECKING:
     from travjax.dataset import Dataset
@@ -38,13 +39,16 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("--model", choices=MODELS, help="the estimator: of a named preset, one of both (resnet50)")
     add_run(parser)
     parser.add_argument(
-        "--data", type=Path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
+        "--data", type=user_path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
     )
     parser.add_argument(
         "--resume", action="store_true", help="go on from the latest checkpoint in --out, if there is one"
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write to (runs/train/ or runs/field/, and the preset's name)"
+        "--out",
+        type=user_path,
+        metavar="DIR",
+        help="folder to write to (runs/train/ or runs/field/, and the preset's name)",
     )
     group = parser.add_argument_group("several processes that train together")
     group.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
@@ -56,7 +60,7 @@ def add(commands: options.Commands) -> None:
 def add_run(parser: argparse._ActionsContainer) -> None:
     """What of a run may differ from its preset; see `run_of`."""
     parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
-    parser.add_argument("--actions", type=Path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     options.add_grid(parser)
     parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
@@ -95,7 +99,8 @@ def run(arguments: argparse.Namespace) -> None:
     require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
     wanted = run_of(preset, arguments)
     folder = arguments.out or Path("runs") / FOLDERS[preset.model] / path.stem
-    train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
+    with going_on("with --resume the same command goes on from the latest checkpoint"):
+        train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
     if devices.main:
         print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")
 
@@ -113,9 +118,15 @@ def train(
     data:   folder of its data set, instead of one made by the preset
     resume: goes on with the run that the folder holds, if it holds one
     option: what a message calls a folder that holds another run
-    Raises InputError before it trains: the folder holds a run that differs or is not to be gone on with, first weights
-    or data set are missing or damaged or do not fit.
+    Raises InputError before it trains: another process works in the folder, it holds a run that differs or is not to be
+    gone on with, first weights or data set are missing or damaged or do not fit.
     """
+    with held(folder) if devices.main else nullcontext():
+        _train(wanted, folder, devices, data, resume, option)
+
+
+def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, resume: bool, option: str) -> None:
+    """`train` in a folder that no other process uses."""
     from travjax.imagenet import load_weights
     from travjax.preset import find_weights
     from travjax.train_field import trainer_of
@@ -163,6 +174,7 @@ def _dataset(data: Path | None, wanted: "Run", folder: Path, devices: "Devices")
     if data:
         return dataset.load(data)
     kept, config = folder / DATA, wanted.preset.dataset
+    put_back(kept)
     for split, size in zip(dataset.SPLITS[:2], config.split_sizes()[:2], strict=True):
         require(size > 0, f"the preset's [dataset]: {split} maps", size, "at least 1: more maps, other shares")
     if devices.main and not (kept / "dataset.json").exists():
@@ -201,7 +213,7 @@ def _finish(folder: Path) -> None:
     from travjax.runlog import read_rows
 
     rows = folder / "metrics.jsonl"
-    tqdm.write("")
+    progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         print(path)
     print(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))

@@ -2,12 +2,11 @@
 
 import argparse
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from travjax.commands import options
 from travjax.config import InputError, require
-from travjax.files import output_folder
+from travjax.files import output_folder, user_path
 from travjax.preprocessing import INPUTS
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ def add(commands: options.Commands) -> None:
     source.add_argument(
         "--from",
         dest="path",
-        type=Path,
+        type=user_path,
         metavar="FILE",
         help="file to convert: .npz, .h5 or .keras of Keras, .safetensors, .pth (.pt, .bin, .ckpt, .pth.tar) of torch",
     )

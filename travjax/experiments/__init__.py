@@ -1,5 +1,11 @@
 """The experiments, a program each: `python -m travjax.experiments.NAME`; experiments/NAME holds recorded results."""
 
-from travjax.entry import quiet_xla
+import sys
+
+from travjax.entry import quiet_xla, settle_streams
+from travjax.signals import end_at_once
 
 quiet_xla()  # here, since the programs import JAX at once
+if sys.argv[:1] == ["-m"]:  # Python looks for the program to run
+    end_at_once()
+    settle_streams()

@@ -15,12 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
-from travjax import bench, curves, metrics, plots
+from travjax import bench, curves, metrics, plots, progress
 from travjax.config import InputError, require, to_json
 from travjax.experiments import launch, timing
-from travjax.files import find_data, output_folder, written_whole
+from travjax.files import find_data, output_folder, save_text, user_path
 from travjax.metrics import OVERALL
 from travjax.models import FIELD, RESNET
 from travjax.predictor import Predictor
@@ -83,11 +81,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = launch.parser("comparison", DESCRIPTION)
     parser.add_argument(
         "--field",
-        type=Path,
+        type=user_path,
         metavar="C",
         help="folder of a run, or .safetensors file, of a hazard field (the package's)",
     )
-    parser.add_argument("--resnet", type=Path, metavar="RUN", help="folder of a ResNet50's run (left out)")
+    parser.add_argument("--resnet", type=user_path, metavar="RUN", help="folder of a ResNet50's run (left out)")
     parser.add_argument(
         "--ground", choices=GROUNDS, default=BOTH, help=f"what is compared on; times with {SYNTHETIC} ground ({BOTH})"
     )
@@ -97,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument(
         "--sites",
-        type=Path,
+        type=user_path,
         metavar="FILE",
         help=f"TOML file of the real sites, whose splits play no part ({SITES}, where its files are found)",
     )
@@ -116,7 +114,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--seed", type=int, default=SEED, metavar="N", help=f"of maps, corruptions and random trajectories ({SEED})"
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("runs/comparison"), metavar="DIR", help="folder to write to (runs/comparison)"
+        "--out",
+        type=user_path,
+        default=Path("runs/comparison"),
+        metavar="DIR",
+        help="folder to write to (runs/comparison)",
     )
     return launch.launch(parser, run, argv)
 
@@ -139,7 +141,7 @@ def run(arguments: argparse.Namespace) -> None:
     seed, named = arguments.seed, (trained.robot, trained.actions, trained.grid)
     real, parts = {}, []
     if sites:
-        with tqdm(desc="windows of sites", unit="window") as bar:
+        with progress.bar("windows of sites", None, "window") as bar:
             real = of_sites(sites, arguments.windows, seed, *named, bar.update)
     validation = _synthetic("validation", arguments.validation_maps, seed + 1, field)
     chosen = best_filters(validation, seed)
@@ -177,7 +179,7 @@ def _sites(given: Path | None, ground: str) -> SitesConfig | None:
 
 def _synthetic(what: str, count: int, seed: int, field: Predictor) -> Ground:
     trained = field.run
-    with tqdm(desc=f"{what} maps", total=count, unit="map") as bar:
+    with progress.bar(f"{what} maps", count, "map") as bar:
         return Ground.synthetic(count, seed, trained.robot, trained.actions, trained.grid, bar.update)
 
 
@@ -240,9 +242,8 @@ def _on_synthetic_ground(
     if network:
         drawn = network["confusion"][OVERALL].samples // len(EVENTS)
         headline += f" The {NETWORK}'s scores are of {drawn:,} random trajectories, the others' of all."
-    with written_whole(out / "f1.tsv") as temporary:
-        lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
-        temporary.write_text("\n".join(lines) + "\n")
+    lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
+    save_text(out / "f1.tsv", "\n".join(lines) + "\n")
     seconds = {row["what"]: row["seconds"] for row in rows}
     figures = {"robustness": curves.robustness_figure(f1), "quality": curves.quality_figure(_points(f1, seconds))}
     tables = {
@@ -272,8 +273,7 @@ def _on_real_ground(
         f"synthetic maps. Seed {arguments.seed}."
     )
     table = sites_table(scores, chosen)
-    with written_whole(out / "sites.txt") as temporary:
-        temporary.write_text(f"{headline}\n\n{table}\n")
+    save_text(out / "sites.txt", f"{headline}\n\n{table}\n")
     f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
     figure = plots.save(curves.sites_figure(f1, IN_FIGURE), out / "sites.png")
     numbers = {
@@ -295,9 +295,8 @@ def _write(parts: Sequence[Part], out: Path) -> None:
         pieces += [f"## {title}\n\n{launch.verbatim(table)}" for title, table in part.tables.items()]
         pieces += [path for path in part.files if path.suffix == ".png"]
     print()
-    with written_whole(out / "results.json") as temporary:
-        numbers = {name: value for part in parts for name, value in part.numbers.items()}
-        temporary.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
+    numbers = {name: value for part in parts for name, value in part.numbers.items()}
+    save_text(out / "results.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
     report = launch.write_report(out, "Simulators and estimators", pieces)
     print(report, out / "results.json", *(path for part in parts for path in part.files), sep="\n")
 

@@ -5,7 +5,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from travjax.entry import Parser, guarded, use_compilation_cache
-from travjax.files import written_whole
+from travjax.files import save_text
+
+GOES_ON = "the same command goes on from there"
+"""What an experiment says when it is stopped."""
 
 Piece = str | Path
 """Of a report: text, or a figure."""
@@ -32,10 +35,7 @@ def launch(
 def write_report(folder: Path, title: str, pieces: Sequence[Piece]) -> Path:
     """Writes report.md: Markdown text, and figures of the folder, which are named after their files."""
     shown = [piece if isinstance(piece, str) else _figure(piece.relative_to(folder)) for piece in pieces]
-    path = folder / "report.md"
-    with written_whole(path) as temporary:
-        temporary.write_text("\n\n".join([f"# {title}", *shown]) + "\n")
-    return path
+    return save_text(folder / "report.md", "\n\n".join([f"# {title}", *shown]) + "\n")
 
 
 def _figure(path: Path) -> str:

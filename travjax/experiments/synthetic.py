@@ -14,11 +14,12 @@ from travjax.commands import train
 from travjax.commands.evaluate import evaluate
 from travjax.config import read_text
 from travjax.experiments import launch
-from travjax.files import find_preset
+from travjax.files import find_preset, held, user_path
 from travjax.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
 from travjax.parallel import Devices
 from travjax.preset import Preset
 from travjax.runlog import read_rows
+from travjax.signals import going_on
 from travjax.trained import Run
 from travjax.traverse import as_in_paper
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     train.add_run(options)
     options.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write to (runs/synthetic/ and the preset's name)"
+        "--out", type=user_path, metavar="DIR", help="folder to write to (runs/synthetic/ and the preset's name)"
     )
     return launch.launch(options, run, argv)
 
@@ -54,9 +55,10 @@ def run(arguments: argparse.Namespace) -> None:
     path = find_preset(arguments.preset, "train")
     wanted = train.run_of(Preset.load(path), arguments)
     folder = arguments.out or Path("runs/synthetic") / path.stem
-    train.train(wanted, folder, Devices.all(), resume=True)
-    scores = evaluate(folder, out=folder / "evaluation")
-    print(launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder)))
+    with held(folder), going_on(launch.GOES_ON):
+        train.train(wanted, folder, Devices.all(), resume=True)
+        scores = evaluate(folder, out=folder / "evaluation")
+        print(launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder)))
 
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:

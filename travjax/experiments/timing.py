@@ -10,9 +10,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import jax
-from tqdm import tqdm
 
-from travjax import bench, plots
+from travjax import bench, plots, progress
 from travjax.actions import ActionSpace
 from travjax.bench_network import BATCH, Bench
 from travjax.commands import options
@@ -95,7 +94,7 @@ def measured(
     robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
 ) -> list[dict]:
     """A row for each way to all trajectories of a map, on the device at hand, with progress bars."""
-    with tqdm(desc=SEQUENTIAL, total=repeats * len(actions), unit="trajectory") as bar:
+    with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
         row = bench.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
     rows = [_row(SEQUENTIAL, f"{bench.processor()}, one core", sequential, len(actions), sequential, repeats)]
@@ -110,7 +109,7 @@ def measured(
         what = f"{NETWORK}, {trunk.dtype}, batches of {batch}"
         yield _row(what, device, row["ms"] / 1e3, len(actions), sequential, repeats)
 
-    return rows + list(tqdm(others(), "batched simulator, network", total=3))
+    return rows + list(progress.bar("batched simulator, network", 3, "row", iterable=others()))
 
 
 def _of_paper() -> list[dict]:

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
+from travjax import progress
 from travjax.commands import evaluate, train
 from travjax.config import InputError, load_toml, read_text, require, to_json
 from travjax.experiments import launch
-from travjax.files import find_preset, output_folder, written_whole
+from travjax.files import find_preset, held, put_back, save_text, user_path
 from travjax.models import FIELD, MODELS, RESNET
+from travjax.signals import going_on
 
 DESCRIPTION = (
     "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "
@@ -42,12 +43,17 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=RESNET,
         help=f"{FIELD} takes the preset PRESET_field ({RESNET})",
     )
-    parser.add_argument("--data", type=Path, metavar="DIR", help="data set of real maps, instead of that of the sites")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="folder to write to (runs/transfer/ and the preset's name)"
+        "--data", type=user_path, metavar="DIR", help="data set of real maps, instead of that of the sites"
     )
     parser.add_argument(
-        "--synthetic", type=Path, metavar="RUN", help="folder of a training run on synthetic maps, instead of a new one"
+        "--out", type=user_path, metavar="DIR", help="folder to write to (runs/transfer/ and the preset's name)"
+    )
+    parser.add_argument(
+        "--synthetic",
+        type=user_path,
+        metavar="RUN",
+        help="folder of a training run on synthetic maps, instead of a new one",
     )
     synthetic = parser.add_argument_group("the synthetic model, unless a folder of it is given")
     train.add_run(synthetic)
@@ -56,22 +62,28 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains what is not trained yet, and writes the results."""
+    suffix = "_field" if arguments.model == FIELD and Path(arguments.preset).suffix != ".toml" else ""
+    path = find_preset(arguments.preset + suffix, "transfer")
+    out = arguments.out or Path("runs/transfer") / path.stem
+    with held(out), going_on(launch.GOES_ON):
+        _run(path, out, arguments)
+
+
+def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
+    """The experiment of a preset in a folder that no other process uses."""
     from travjax.parallel import Devices
     from travjax.transfer import Transfer, TransferConfig, run_all
     from travjax.transfer_scores import Results
 
-    suffix = "_field" if arguments.model == FIELD and Path(arguments.preset).suffix != ".toml" else ""
-    path = find_preset(arguments.preset + suffix, "transfer")
     config, devices = load_toml(path, TransferConfig), Devices.all()
-    out = output_folder(arguments.out or Path("runs/transfer") / path.stem)
     _require_same(out, config)
-    base = _base(path.parent / config.synthetic, arguments)
+    base = _base(path.parent / user_path(config.synthetic), arguments)
     synthetic = arguments.synthetic or out / "synthetic"
-    data = _data(path.parent / config.sites, arguments.data, base, out)
+    data = _data(path.parent / user_path(config.sites), arguments.data, base, out)
     transfer = Transfer(config, base, synthetic, data, out, devices)  # refuses what does not fit before hours of work
     if not arguments.synthetic:
         _train_synthetic(base, synthetic, devices)
-    say = lambda arm, seed: tqdm.write(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
+    say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
     _write(transfer, Results.of(run_all(transfer, say)), out)
 
 
@@ -83,8 +95,7 @@ def _require_same(out: Path, config) -> None:
         raise InputError(
             f"--out {out}: holds an experiment of another preset; allowed: another folder, or the same preset"
         )
-    with written_whole(path) as temporary:
-        temporary.write_text(text)
+    save_text(path, text)
 
 
 def _base(preset: Path, arguments: argparse.Namespace):
@@ -118,6 +129,7 @@ def _data(sites: Path, given: Path | None, base, out: Path):
 
     if given:
         return dataset.load(given)
+    put_back(out / DATA)
     if (out / DATA / "dataset.json").exists():
         return dataset.load(out / DATA)
     from travjax.commands.dataset import made_of_sites
@@ -154,8 +166,7 @@ def _write(transfer, results, out: Path) -> None:
     }
     provenance = transfer.dataset.provenance
     described |= {"machine": machine(), "real": provenance and provenance.to_json()}
-    with written_whole(out / "results.json") as temporary:
-        temporary.write_text(json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
+    save_text(out / "results.json", json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
     intro = (
         f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_samples(transfer)} "
         f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
@@ -204,7 +215,7 @@ def _maps_figure(transfer):
     models = {"before": transfer.pretrained, "after": transfer.estimator(transfer.arms[-1], config.seeds[0])}
     predictions = {}
     for name, estimator in models.items():
-        with tqdm(desc=f"maps for the figure, {name}", total=len(shown) * len(base.actions), unit="sample") as bar:
+        with progress.bar(f"maps for the figure, {name}", len(shown) * len(base.actions), "sample") as bar:
             predictions[name] = evaluator.whole_maps(estimator, shown, bar.update)
     failed, known = map(np.asarray, unpacked(data.labels[shown]))
     places = data.provenance.origin[shown] if data.provenance else shown

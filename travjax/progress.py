@@ -1,0 +1,20 @@
+"""Progress bars for those who watch, and lines that do not run into them."""
+
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+Bar = tqdm
+
+
+def bar(what: str, total: float | None, unit: str, quiet: bool = False, **options: Any) -> Bar:
+    """A bar on standard error, if that is a terminal: a log file has no use for one that is drawn over and over."""
+    watched = sys.stderr is not None and sys.stderr.isatty()
+    return tqdm(desc=what, total=total, unit=unit, disable=quiet or not watched, **options)
+
+
+def say(text: str) -> None:
+    """Prints a line above the bars."""
+    if sys.stdout is not None:
+        tqdm.write(text)

@@ -1,0 +1,67 @@
+"""What SIGINT and SIGTERM do to a program: one line, an exit code of 128 and the signal's number, and no remains."""
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import NoReturn
+
+ENDINGS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+"""What the program says of each."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, from a scheduler or a container: what cleans up after SIGINT does so after it as well."""
+
+
+def end_at_once() -> None:
+    """Lets a signal end the program where nothing is to be cleaned up: libraries swallow exceptions on import."""
+    for number in _heeded():
+        signal.signal(number, _end)
+
+
+@contextmanager
+def raised() -> Iterator[None]:
+    """Lets SIGINT raise KeyboardInterrupt and SIGTERM its Terminated while the block runs."""
+    before = {number: signal.signal(number, _raise) for number in _heeded()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def going_on(how: str) -> Iterator[None]:
+    """Lets a program that is stopped in the block say how it goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        error.add_note(how)
+        raise
+
+
+def ending(error: KeyboardInterrupt) -> tuple[int, str]:
+    """The exit code of a program that a signal ended, and its line: the error's notes say how it goes on."""
+    number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
+    return 128 + number, "; ".join([ENDINGS[number], *getattr(error, "__notes__", [])])
+
+
+def _heeded() -> list[signal.Signals]:
+    """Those that whoever started the program has not told it to ignore, as nohup and a shell's & do."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    return [number for number in ENDINGS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+
+
+def _raise(number: int, frame: FrameType | None) -> NoReturn:
+    raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+
+
+def _end(number: int, frame: FrameType | None) -> NoReturn:
+    try:
+        os.write(2, f"travjax: {ENDINGS[signal.Signals(number)]}\n".encode())
+    finally:
+        os._exit(128 + number)
