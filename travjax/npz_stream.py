@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import IO
 
@@ -66,19 +66,22 @@ class NpzStream:
             arrays[name] = np.memmap(file, dtype, "r", shape=(self.count, *shape))
         return arrays
 
-    def save(self, **more: np.ndarray | str | float) -> Path:
-        """Writes what was added, and arrays beside it, to the .npz, whole or not at all."""
+    def save(self, without: Collection[str] = (), **more: np.ndarray | str | float) -> Path:
+        """Writes what was added, and arrays beside it, to the .npz, whole or not at all; `without` is left out."""
         with (
             written_whole(self.path) as temporary,
             zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive,
         ):
             for name, (file, dtype, shape) in self._files.items():
+                if name in without:
+                    continue
                 file.seek(0)
                 header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False}
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array_header_1_0(member, header | {"shape": (self.count, *shape)})
                     shutil.copyfileobj(file, member, 2**20)
-            for name, array in (self._joined() | more).items():
+            held = {name: array for name, array in self._joined().items() if name not in without}
+            for name, array in (held | more).items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     np.lib.format.write_array(member, np.asanyarray(array), allow_pickle=False)
         return self.path

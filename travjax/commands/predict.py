@@ -1,16 +1,21 @@
 """`travjax predict`: probabilities of failure for every trajectory of maps, by a trained estimator."""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from travjax import progress
 from travjax.commands import label, options
 from travjax.config import require
-from travjax.files import output_folder, save_npz, save_text, user_path
-from travjax.labelling import Batch, joined, labelled, samples, title
+from travjax.files import output_folder, save_text, user_path
+from travjax.labelling import Batch, bytes_each, labelled, samples, title
 from travjax.models import MODELS
+from travjax.npz_stream import NpzStream
+from travjax.traverse import EVENTS
+
+if TYPE_CHECKING:
+    from travjax.predictor import Predictor
 
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
@@ -66,47 +71,50 @@ def run(arguments: argparse.Namespace) -> None:
     predictor.require_same(Robot.load(arguments.robot) if arguments.robot else None)
     total, source, files = label.maps_of(arguments, trained.grid)
     out = output_folder(arguments.out)
-    maps = joined(list(options.progress((_simulated(batch, predictor) for batch in source), total, "simulator")))
-    with progress.bar("predicting", total * len(trained.actions), "trajectory") as bar:
-        predicted = predictor.predict(maps["heights"], bar.update)
-    fails = predicted.probability >= PROBABILITY
-    table = report.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
-    headline = f"Predicted to fail, {trained.robot.name}, {len(trained.actions)} trajectories a map, {model}:"
-    text = f"{headline}\n{table}"
-    if arguments.check:
-        text += f"\n\n{_checked(maps, predicted.probability)}"
-    arrays = {"probability": predicted.probability, "group": maps["group"], "known": maps["known"]}
-    arrays |= {name: maps[name] for name in ("origin", "height_offset", "crs", "seed") if name in maps}
-    if predicted.margins is not None:
-        arrays |= {f"margin_{name}": predicted.margins[..., k] for k, name in enumerate(("step", "obstacle", "tilt"))}
-    if arguments.check:
-        arrays |= {"failed": maps["failed"]}
     config = options.configuration_json(
         trained.robot, trained.actions, trained.grid, files=files, model=model, world=arguments.world
     )
-    saved = save_npz(out / "predictions.npz", config=config, cell_size=trained.grid.spacing, **arrays)
-    shares = save_text(out / "shares.txt", f"{text}\n")
-    print(f"\n{text}\n\n{saved}\n{shares}")
-    if not arguments.no_figures:
-        print(_figure(maps, predicted.probability, predictor, arguments.check, out))
+    size = bytes_each(trained.actions, trained.grid) + len(trained.actions) * 6 * 4
+    with NpzStream(out / "predictions.npz", total, size, "predicted maps") as predictions:
+        with progress.bar("predicting", total * len(trained.actions), "trajectory") as bar:
+            for batch in source:
+                predictions.append(_predicted(batch, predictor, bar.update))
+        maps = predictions.arrays
+        fails = maps["probability"] >= PROBABILITY
+        table = report.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
+        text = f"Predicted to fail, {trained.robot.name}, {len(trained.actions)} trajectories a map, {model}:\n{table}"
+        if arguments.check:
+            text += f"\n\n{_checked(maps)}"
+        unsaved = ("heights",) if arguments.check else ("heights", "failed")
+        saved = predictions.save(unsaved, config=config, cell_size=trained.grid.spacing)
+        shares = save_text(out / "shares.txt", f"{text}\n")
+        print(f"\n{text}\n\n{saved}\n{shares}")
+        if not arguments.no_figures:
+            print(_figure(maps, predictor, arguments.check, out))
 
 
-def _simulated(batch: Batch, predictor) -> Batch:
-    """The batch with what the simulator says of it; which trajectories touch unknown ground is needed in any case."""
+def _predicted(batch: Batch, predictor: "Predictor", on_progress: Callable[[int], object]) -> Batch:
+    """A batch with what is predicted, and of the simulator what fails and which trajectories touch unknown ground."""
     trained = predictor.run
-    return labelled(batch, trained.robot, trained.actions, trained.grid)
+    simulated = labelled(batch, trained.robot, trained.actions, trained.grid)
+    predicted = predictor.predict(batch["heights"], on_progress)
+    kept = ("heights", "group", "known", "failed", "origin", "height_offset", "crs", "seed")
+    found = {name: simulated[name] for name in kept if name in simulated} | {"probability": predicted.probability}
+    if predicted.margins is not None:
+        found |= {f"margin_{name}": predicted.margins[..., event] for event, name in enumerate(EVENTS)}
+    return found
 
 
-def _checked(maps: Batch, probability: np.ndarray) -> str:
+def _checked(maps: Batch) -> str:
     """The predictions against the simulator on the maps as given; on noisy ones that is not what a robot meets."""
     from travjax import metrics, report
 
     known = maps["known"]
-    scores = metrics.evaluate(probability[known], maps["failed"][known])
+    scores = metrics.evaluate(maps["probability"][known], maps["failed"][known])
     return f"{AGAINST}:\n{report.metrics_table(scores, None)}"
 
 
-def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: Path) -> Path:
+def _figure(maps: Batch, predictor: "Predictor", check: bool, out: Path) -> Path:
     """The action space of a few maps in safe, doubtful and failing; `check` adds the simulator's below it."""
     from travjax import plots
 
@@ -114,7 +122,7 @@ def _figure(maps: Batch, probability: np.ndarray, predictor, check: bool, out: P
     titles = [title(maps, index) for index in shown]
     figure = plots.predicted_maps(
         maps["heights"][shown],
-        {"predicted": probability[shown]},
+        {"predicted": maps["probability"][shown]},
         maps["failed"][shown] if check else None,
         maps["known"][shown],
         titles,
