@@ -14,7 +14,7 @@ from PIL import Image
 
 from travjax.config import InputError
 from travjax.dem_options import DemOptions
-from travjax.raster_files import DRIVERS, read_raster
+from travjax.raster_files import DRIVERS, _FromFile, read_raster
 
 CELL = 0.0625
 WEST, SOUTH = 500_000.25, 5_000_000.5
@@ -61,7 +61,7 @@ def refusal(path: Path, **options) -> str:
 def test_a_raster_that_runs_south_and_one_that_runs_north_are_the_same(tmp_path):
     for south_up in (False, True):
         raster = read_raster(write(tmp_path / "a.tif", south_up=south_up, crs="EPSG:32632"), DemOptions())
-        np.testing.assert_array_equal(raster.heights, HEIGHTS)
+        np.testing.assert_array_equal(raster.heights[0:20, 0:24], HEIGHTS)
         assert raster.origin == pytest.approx((WEST, SOUTH), abs=1e-9)
         assert (raster.cell_size, raster.crs) == (CELL, "EPSG:32632")
 
@@ -100,7 +100,7 @@ def test_a_picture_wants_both_scales_whatever_its_format(tmp_path):
         assert refusal(path, cell_size=CELL).startswith("height_scale is missing: a ")
         assert refusal(path, height_scale=1 / 64).startswith("cell_size is missing")
         raster = read_raster(path, DemOptions(cell_size=CELL, height_scale=1 / 64))
-        np.testing.assert_array_equal(raster.heights, HEIGHTS)
+        np.testing.assert_array_equal(raster.heights[0:20, 0:24], HEIGHTS)
         assert raster.origin == (0, 0)
 
 
@@ -178,7 +178,7 @@ def write_netcdf(path: Path, **variables: tuple[np.ndarray, str]) -> Path:
 def test_a_variable_of_a_netcdf_is_read_by_its_name(tmp_path):
     path = write_netcdf(tmp_path / "a.nc", z=(HEIGHTS, "m"), depth=(HEIGHTS + 5, "cm"))
     raster = read_raster(path, DemOptions(band="z"))
-    np.testing.assert_array_equal(raster.heights, HEIGHTS)
+    np.testing.assert_array_equal(raster.heights[0:20, 0:24], HEIGHTS)
     assert raster.origin == pytest.approx((WEST, SOUTH), abs=1e-6)
     assert refusal(path).startswith("--band = None: must be a variable of the file: ")
     assert refusal(path, band="q").startswith("--band = 'q': must be a variable of the file: ")
@@ -237,7 +237,7 @@ def test_a_large_raster_is_read_from_the_file_part_by_part(tmp_path, monkeypatch
     marked[3, 5] = -9999
     for south_up in (False, True):
         heights = read_raster(write(tmp_path / "a.tif", marked, south_up=south_up, nodata=-9999), DemOptions()).heights
-        assert not isinstance(heights, np.ndarray)
+        assert isinstance(heights, _FromFile)
         expected = np.where(marked == -9999, np.nan, HEIGHTS)
         np.testing.assert_array_equal(heights[2:7, 3:20], expected[2:7, 3:20])
         np.testing.assert_array_equal(heights[0:20, 0:24], expected)

@@ -77,10 +77,14 @@ def rasters_of(entries: Entries, options: DemOptions, names: list[str] | None = 
     ours = "config" in (names or ()) and "height_offset" in entries
     scale, notes = options.height_scale or 1.0, marks_nothing(options.nodata, heights.dtype)
     rasters = []
+    places = np.broadcast_to(origins, (each, 2))
+    for name in dict.fromkeys(systems):
+        there = places if len(systems) == 1 else places[[name == other for other in systems]]
+        x, y = there.mean(axis=0).tolist()
+        require_metric_named(name, x, y, options.height_scale is not None)
     for index, one in enumerate(maps):
-        (x, y), offset = origins[index % len(origins)], offsets[index % len(offsets)]
+        (x, y), offset = places[index], offsets[index % len(offsets)]
         crs = systems[index % len(systems)] if systems else None
-        require_metric_named(crs, x, y, options.height_scale is not None)
         values = InMetres(one, scale, 0.0 if ours else offset, nodata=options.nodata)
         rasters.append(Raster(values, cell_size, (float(x), float(y)), crs, notes, float(offset) if ours else None))
         notes = ()

@@ -17,6 +17,7 @@ from travjax.config import InputError, require
 from travjax.coordinates import name_of, parsed, require_height_unit_named, require_metric
 from travjax.dem_options import DemOptions
 from travjax.formats import OTHERS
+from travjax.memory import require_memory
 from travjax.raster import Heights, InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 
 PICTURES = ("BMP", "GIF", "BIGGIF", "JP2OpenJPEG", "JPEG", "PNG", "PNM", "SGI", "TGA", "WEBP")
@@ -65,9 +66,12 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
         east, north = (origin[k] + cell_size * (edge - 1) / 2 for k, edge in enumerate(file.shape[::-1]))
         require_metric(crs, east, north, options.height_scale is not None)
         scale = file.scales[band - 1] if options.height_scale is None else options.height_scale
-        heights: Heights = _FromFile(file, band, scale, file.offsets[band - 1], options.nodata, southern)
+        in_metres = scale, file.offsets[band - 1]
         if np.prod(file.shape) <= WHOLE or file.driver in PICTURES:
-            heights = heights[0 : file.height, 0 : file.width]
+            require_memory(3 * int(np.prod(file.shape)) * dtype.itemsize, f"{file.width} x {file.height} pixels")
+            heights: Heights = _in_metres(file.read(band, masked=True), in_metres, options.nodata, southern)
+        else:
+            heights = _FromFile(file, band, in_metres, options.nodata, southern)
     return Raster(heights, cell_size, origin, name_of(crs), marks_nothing(options.nodata, dtype))
 
 
@@ -174,9 +178,9 @@ def _require_own_data(path: Path) -> None:
 class _FromFile:
     """Heights of a band that are read from the file as they are asked for; see raster.Heights."""
 
-    def __init__(self, file: Any, band: int, scale: float, offset: float, nodata: float | None, southern: bool):
-        self._file, self._band, self._in_metres, self._southern = file, band, (scale, offset), southern
-        self._nodata = nodata
+    def __init__(self, file: Any, band: int, in_metres: tuple[float, float], nodata: float | None, southern: bool):
+        self._file, self._band, self._in_metres = file, band, in_metres
+        self._nodata, self._southern = nodata, southern
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -191,8 +195,15 @@ class _FromFile:
         with _gdal():
             window = Window.from_slices((north.start, north.stop), (cols.start, cols.stop))
             read = self._file.read(self._band, window=window, masked=True)
-        heights = InMetres(read.data, *self._in_metres, np.ma.getmaskarray(read), self._nodata, self._southern)
-        return heights[:, :]
+        return _in_metres(read, self._in_metres, self._nodata, self._southern)[:, :]
+
+
+def _in_metres(
+    read: np.ma.MaskedArray, in_metres: tuple[float, float], nodata: float | None, southern: bool
+) -> InMetres:
+    """Pixels as heights; in_metres: scale and offset."""
+    unknown = np.ma.getmaskarray(read)
+    return InMetres(read.data, *in_metres, unknown if unknown.any() else None, nodata, southern)
 
 
 def _variable(path: Path, file: Any, name: int | str | None) -> tuple[Any, bool]:
