@@ -9,6 +9,7 @@ import math
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from travjax.preset import Preset
 from travjax.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.robot import Robot
 from travjax.runlog import read_rows
+from travjax.train import Position
 from travjax.trained import Run, load_estimator
 
 from .worker import Format, Invalid
@@ -257,7 +259,8 @@ def _model(folder: Path) -> None:
 
 def _checkpoint(folder: Path) -> None:
     RUN.save(folder)
-    meta = {"dataset": "0123", "optimizer": 0, "position": {"phase": 2, "epoch": 1, "step": 3, "total": 8}}
+    position = Position(phase=2, epoch=1, step=3, total=8, loss=0.5, samples=4)
+    meta = {"dataset": "0123", "optimizer": 0, "position": asdict(position)}
     Checkpoints(folder / "checkpoints").save(8, _variables(), meta, best=True)
 
 
