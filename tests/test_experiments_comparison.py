@@ -202,7 +202,8 @@ def test_the_figures_of_a_site_are_those_of_its_windows(done, sites):
 
 def test_the_table_has_a_row_a_site_and_the_filter_that_was_chosen(done):
     results = json.loads((done[0] / "results.json").read_text())
-    lines = (done[0] / "sites.txt").read_text().splitlines()
+    headline, *lines = (done[0] / "sites.txt").read_text().splitlines()
+    assert headline.startswith("Husky A200, windows of 4 x 4 m, ")
     rows = [line.split() for line in lines if "ridge" in line or "plain" in line]
     assert len(rows) == 2 * len(CORRUPTIONS)
     for number, name in enumerate(CORRUPTIONS):

@@ -12,7 +12,7 @@ from fuzz.formats import FORMATS
 from fuzz.mutations import KINDS, mutated
 from fuzz.worker import ACCEPTED, FAILED, REFUSED
 
-CASES = 12
+CASES = 10
 """Of each format; `python -m tests.fuzz --case FORMAT:SEED` repeats one."""
 
 

@@ -3,20 +3,20 @@
 A new kind of file is one entry of FORMATS, a worker.Format; `dem` and `cloud` make those of elevation maps.
 """
 
-import datetime
 import hashlib
 import json
 import math
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
 
 import jax
 import numpy as np
 from field_runs import RUN
-from points import points_of, write_las, write_ply, write_pts, write_text
+from points import CLOUDS, points_of, write_las, write_ply, write_text
 from test_imagenet import NARROW, canonical_arrays, keras_arrays, torchvision_arrays, write
 
 from travjax.actions import ActionSpace
@@ -31,6 +31,7 @@ from travjax.preset import Preset
 from travjax.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.robot import Robot
 from travjax.runlog import read_rows
+from travjax.train import Position
 from travjax.trained import Run, load_estimator
 
 from .worker import Format, Invalid
@@ -74,12 +75,30 @@ def _require(right: bool, what: str, value: object) -> None:
         raise Invalid(f"{what} = {value!r:.100}")
 
 
-def _geotiff(path: Path) -> None:
+TILES = {"blockxsize": 16, "blockysize": 16}
+
+
+def _geotiff(path: Path, **options) -> None:
     import rasterio
 
-    profile = dict(driver="GTiff", width=35, height=34, count=1, dtype="float32", crs="EPSG:32632", nodata=-9999)
-    with rasterio.open(path, "w", transform=rasterio.Affine(CELL, 0, 500000, 0, -CELL, 5000000), **profile) as file:
+    profile = dict(width=35, height=34, count=1, dtype="float32", crs="EPSG:32632", nodata=-9999) | options
+    place = rasterio.Affine(CELL, 0, 500000, 0, -CELL, 5000000)
+    with rasterio.open(path, "w", driver="GTiff", transform=place, **profile) as file:
         file.write(np.nan_to_num(heights()[::-1], nan=-9999), 1)
+
+
+def _netcdf(path: Path) -> None:
+    from scipy.io import netcdf_file
+
+    with netcdf_file(path, "w") as file:
+        for name, count, start in (("y", 34, 900.0), ("x", 35, 500.0)):
+            file.createDimension(name, count)
+            axis = file.createVariable(name, "d", (name,))
+            axis[:] = start + CELL * np.arange(count)
+            axis.units, axis.standard_name = b"m", f"projection_{name}_coordinate".encode()
+        z = file.createVariable("z", "f", ("y", "x"))
+        z[:] = np.nan_to_num(heights(), nan=-9999)
+        z.units, z._FillValue = b"m", np.float32(-9999)
 
 
 def _ascii_grid(path: Path) -> None:
@@ -121,15 +140,16 @@ def cloud(name: str, make: Callable[[Path, np.ndarray], object], off: float = 0.
         points = points_of(heights(), CELL, 500.0, 900.0)
         points[:, :2] += off * np.random.default_rng(1).random((len(points), 2))
         make(path, points)
+        if path.suffix in (".las", ".laz"):
+            _of_one_day(path)
 
     return dem(name, written, cell_size=CELL if off else None)
 
 
-def _las(path: Path, points: np.ndarray, **settings) -> None:
-    write_las(path, points, **settings)
+def _of_one_day(path: Path) -> None:
+    """Sets the date in the header of a LAS file, so that it is the same each day."""
     data = bytearray(path.read_bytes())
-    day = datetime.date(2025, 1, 1).timetuple()
-    data[90:94] = day.tm_yday.to_bytes(2, "little") + day.tm_year.to_bytes(2, "little")  # the same file each day
+    data[90:94] = (1).to_bytes(2, "little") + (2025).to_bytes(2, "little")
     path.write_bytes(data)
 
 
@@ -138,17 +158,16 @@ ELEVATION = {
     "npz": dem("site.npz", _npz),
     "npz of several maps": dem("labels.npz", _labels),
     "GeoTIFF": dem("site.tif", _geotiff),
+    "GeoTIFF, deflated": dem("site.tif", lambda path: _geotiff(path, compress="deflate", tiled=True, **TILES)),
+    "netCDF": dem("site.nc", _netcdf),
     "ASCII grid": dem("site.asc", _ascii_grid),
     "PNG": dem("site.png", _png, _png_checksums, cell_size=CELL, height_scale=0.001),
-    "XYZ": cloud("site.xyz", write_text),
-    "CSV": cloud("site.csv", lambda path, points: write_text(path, points, ",", "x,y,z"), off=0.1),
-    "PTS": cloud("site.pts", write_pts),
-    "PLY": cloud("site.ply", write_ply, off=0.1),
-    "PLY in text": cloud("site.ply", lambda path, points: write_ply(path, points, text=True)),
-    "LAS": cloud("site.las", _las),
-    "LAS 1.4": cloud("site.las", lambda path, points: _las(path, points, point_format=6), off=0.1),
-    "LAZ": cloud("site.laz", _las),
+    **{name: cloud(*entry) for name, entry in CLOUDS.items()},
+    "CSV, scattered": cloud("site.csv", lambda path, points: write_text(path, points, ",", "x,y,z"), off=0.1),
+    "PLY, scattered": cloud("site.ply", write_ply, off=0.1),
+    "LAS, scattered": cloud("site.las", write_las, off=0.1),
 }
+"""Those of clouds come from points.py, which the tests of clouds share."""
 
 
 # ---- Configurations
@@ -240,7 +259,8 @@ def _model(folder: Path) -> None:
 
 def _checkpoint(folder: Path) -> None:
     RUN.save(folder)
-    meta = {"dataset": "0123", "optimizer": 0, "position": {"phase": 2, "epoch": 1, "step": 3, "total": 8}}
+    position = Position(phase=2, epoch=1, step=3, total=8, loss=0.5, samples=4)
+    meta = {"dataset": "0123", "optimizer": 0, "position": asdict(position)}
     Checkpoints(folder / "checkpoints").save(8, _variables(), meta, best=True)
 
 
