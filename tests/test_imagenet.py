@@ -465,6 +465,7 @@ FEATURES = 128
 
 HEADS = {
     "of 10 classes": {"fc.weight": (10, FEATURES), "fc.bias": (10,)},
+    "without a bias": {"fc.weight": (1000, FEATURES)},
     "of two layers": {"fc.0.weight": (64, FEATURES), "fc.0.bias": (64,), "fc.2.weight": (5, 64), "fc.2.bias": (5,)},
     "of another name": {"last_linear.weight": (1000, FEATURES), "last_linear.bias": (1000,)},
     "with a norm": {"head.1.weight": (9, FEATURES), "head.0.weight": (FEATURES,), "head.0.running_var": (FEATURES,)},

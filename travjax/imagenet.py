@@ -86,7 +86,7 @@ def load_weights(
     """
     path = Path(path)
     try:
-        require(input is None or input in INPUTS, "input", input, f"one of {', '.join(INPUTS)}")
+        require(input is None or input in list(INPUTS), "input", input, f"one of {', '.join(INPUTS)}")
         with open_arrays(path) as file:
             network = recognised(file.arrays, _NAMINGS, _shapes(config), prefix)
             arrays = _read(file.arrays, network, config)

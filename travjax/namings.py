@@ -196,12 +196,12 @@ def _sorted_out(
 
 
 def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], naming: Naming, top: dict) -> bool:
-    """Whether the top layer is one of another number of classes."""
+    """Whether the top layer is one of another number of classes, or without a bias."""
     kernel, bias = (found.get(in_file(name)) for name in top)
-    if kernel is None or bias is None or len(kernel.shape) != 2:
+    if kernel is None or len(kernel.shape) != 2:
         return False
     features, classes = kernel.shape[::-1] if naming.by_output else kernel.shape
-    return features == top["fc1000/kernel"][0] and classes != CLASSES and bias.shape == (classes,)
+    return features == top["fc1000/kernel"][0] and (classes != CLASSES or bias is None)
 
 
 def _are_heads(shapes: list[tuple[int, ...]], features: int) -> bool:

@@ -20,9 +20,9 @@ def add(commands: options.Commands) -> None:
         "weights",
         help="convert ImageNet weights of a ResNet50",
         description="Checks ImageNet weights of a ResNet50 name by name and shape by shape, says what they are, and "
-        "writes them as DIR/resnet50.safetensors. Names may be those of torchvision, Hugging Face, Detectron2 or Keras, "
-        "after any prefix (state_dict.module.); only the trunk is needed, other heads are left out. Not read are "
-        "pickles of arrays (.pkl), weights in several files, .onnx, .msgpack, and files of TensorFlow.",
+        "writes them as DIR/resnet50.safetensors. Names may be those of torchvision, Hugging Face, Detectron2 or "
+        "Keras, after any prefix (state_dict.module.); only the trunk is needed, other heads are left out. Not read "
+        "are pickles of arrays (.pkl), weights in several files, .onnx, .msgpack, and files of TensorFlow.",
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
