@@ -465,6 +465,7 @@ FEATURES = 128
 
 HEADS = {
     "of 10 classes": {"fc.weight": (10, FEATURES), "fc.bias": (10,)},
+    "without a bias": {"fc.weight": (1000, FEATURES)},
     "of two layers": {"fc.0.weight": (64, FEATURES), "fc.0.bias": (64,), "fc.2.weight": (5, 64), "fc.2.bias": (5,)},
     "of another name": {"last_linear.weight": (1000, FEATURES), "last_linear.bias": (1000,)},
     "with a norm": {"head.1.weight": (9, FEATURES), "head.0.weight": (FEATURES,), "head.0.running_var": (FEATURES,)},
@@ -506,6 +507,46 @@ def test_of_several_networks_one_has_to_be_named(tmp_path):
         np.testing.assert_array_equal(found.arrays["conv1/kernel"], canonical_arrays(seed=seed)["conv1/kernel"])
     with pytest.raises(InputError, match="no array of a ResNet among its 534 that begin with 'ema.'"):
         load_weights(path, NARROW, prefix="ema.")
+
+
+def detectron_arrays(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same in the names of detectron2's ResNet, in a detector."""
+    named = {}
+    for name, array in torchvision_arrays(arrays).items():
+        *place, layer, kind = name.replace("downsample.0", "shortcut").replace("downsample.1", "shortcut_bn").split(".")
+        if layer != "fc" and kind != "num_batches_tracked":
+            block = f"res{int(place[0][5:]) + 1}.{place[1]}" if place else "stem"
+            norm = layer.startswith("bn") or layer == "shortcut_bn"
+            layer = layer.replace("bn", "conv") if layer.startswith("bn") else layer.removesuffix("_bn")
+            named[f"model.backbone.bottom_up.{block}.{layer}{'.norm' if norm else ''}.{kind}"] = array
+    return named | {"model.backbone.fpn_lateral2.weight": np.ones((8, 16, 1, 1), np.float32)}
+
+
+def test_names_of_detectron2(tmp_path):
+    theirs = detectron_arrays(caffe_arrays_by_canonical_name())
+    assert {
+        "model.backbone.bottom_up.stem.conv1.norm.running_mean",
+        "model.backbone.bottom_up.res2.0.shortcut.weight",
+        "model.backbone.bottom_up.res4.5.conv2.norm.weight",
+    } < theirs.keys() and len(theirs) == 53 * 5 + 1
+    weights = load_weights(write(tmp_path / "a.pth", theirs), NARROW)
+    assert (weights.naming, weights.stride_in, weights.input) == ("Detectron2", "1x1", "caffe")
+    assert weights.left_out == ("model.backbone.fpn_lateral2.weight [8, 16, 1, 1]",)
+    for name, array in canonical_arrays(top=False).items():
+        np.testing.assert_allclose(weights.arrays[name], array, rtol=1e-6)
+
+
+def caffe_arrays_by_canonical_name() -> dict[str, np.ndarray]:
+    """Of a first kernel that takes B, G, R from 0 to 255."""
+    arrays = canonical_arrays(top=False)
+    kernel = (arrays["conv1/kernel"] / (255 * STD)[:, None]).astype(np.float32)
+    return arrays | {"conv1/kernel": np.ascontiguousarray(kernel[:, :, ::-1])}
+
+
+def test_a_few_names_of_a_network_do_not_make_several(tmp_path):
+    names = [f"{block}.conv{number}.weight" for block in ("first", "second") for number in (1, 2)]
+    message = refusal(write(tmp_path / "a.safetensors", {name: np.ones(3, np.float32) for name in names}))
+    assert message.startswith("26") and " of torchvision naming wrong" in message and " is missing" in message
 
 
 def test_arrays_of_the_other_byte_order_and_of_bfloat16(tmp_path):
@@ -609,6 +650,7 @@ def test_weights_of_a_network_before_training_are_read(tmp_path, suffix):
     named = {".npz": lambda a: a, ".h5": keras_arrays, ".safetensors": torchvision_arrays}[suffix](arrays)
     weights = load_weights(write(tmp_path / f"a{suffix}", named), NARROW)
     np.testing.assert_array_equal(weights.arrays["res4f_branch2b/kernel"], arrays["res4f_branch2b/kernel"])
+    assert re.search("^statistics +0 and 1: a network before training$", describe(weights), re.MULTILINE)
 
 
 def test_what_a_converted_file_is_made_for_is_not_said_again(tmp_path):
@@ -616,7 +658,8 @@ def test_what_a_converted_file_is_made_for_is_not_said_again(tmp_path):
         write(tmp_path / "a.safetensors", caffe_arrays(True)), NARROW, input="caffe", stride_in="1x1"
     )
     save_safetensors(weights, tmp_path / "b.safetensors")
-    again = load_weights(tmp_path / "b.safetensors", NARROW)  # whose statistics are 0 and 1 still
+    again = load_weights(tmp_path / "b.safetensors", NARROW)
+    assert re.search("^statistics +0 and 1: none, gamma and beta hold them$", describe(again), re.MULTILINE)
     assert (again.stride_in, again.origin) == ("1x1", "a.safetensors, torchvision names, input caffe")
     for told in ({"input": "caffe"}, {"stride_in": "3x3"}):
         with pytest.raises(InputError, match=f"{next(iter(told))} = '.*': must be "):
@@ -677,6 +720,9 @@ def test_our_weights_are_described():
     assert rows["top layer"] == "1000 classes"
     assert rows["strides"] == "in the 1x1 convolutions (v1)"
     assert rows["batch-norm epsilon"] == "1e-05"
+    assert rows["statistics"] == "measured"
+    assert rows["left out"] == "nothing"
+    assert rows["made for"] == rows["input"] == "R, G, B, (x / 255 - mean) / std"
 
 
 # Weights into a network

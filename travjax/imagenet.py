@@ -23,7 +23,7 @@ from travjax.config import InputError, require
 from travjax.files import user_path
 from travjax.namings import CLASSES, Recognised, recognised
 from travjax.namings import NAMINGS as _NAMINGS
-from travjax.preprocessing import INPUTS, converted, has_statistics, require_fit, require_statistics
+from travjax.preprocessing import INPUTS, converted, has_statistics, is_untrained, require_fit, require_statistics
 from travjax.resnet import ResNet, ResNetConfig
 from travjax.stored_arrays import Stored, WeightFile, shown
 from travjax.weight_files import open_arrays, write_safetensors
@@ -87,7 +87,7 @@ def load_weights(
     """
     path = user_path(path)
     try:
-        require(input is None or input in INPUTS, "input", input, f"one of {', '.join(INPUTS)}")
+        require(input is None or input in list(INPUTS), "input", input, f"one of {', '.join(INPUTS)}")
         with open_arrays(path) as file:
             network = recognised(file.arrays, _NAMINGS, _shapes(config), prefix)
             arrays = _read(file.arrays, network, config)
@@ -106,7 +106,7 @@ def _settings(file: WeightFile, network: Recognised, input: str | None, stride_i
     if notes:
         require(input in (None, "torch"), "input", input, "left out: the file is one of travjax weights, for torch")
         require(stride_in in (None, notes.get("stride_in")), "stride_in", stride_in, f"{notes.get('stride_in')!r} here")
-    elif (input or "").startswith("caffe") and naming.by_output:
+    elif input != naming.input and (input or "").startswith("caffe") and naming.by_output:
         allowed = "1x1, as in most of Caffe's, or 3x3: --stride-in, which names do not say"
         require(stride_in is not None, "stride_in", stride_in, allowed)
     given = "" if input in (None, naming.input) else f", input {input}"
@@ -252,10 +252,18 @@ def describe(weights: Weights) -> str:
         "left out": _left_out(weights),
         "strides": f"in the {weights.stride_in} convolutions ({'v1' if weights.stride_in == '1x1' else 'v1.5'})",
         "batch-norm epsilon": f"{weights.epsilon:g}",
+        "statistics": _statistics(weights.arrays),
         "made for": INPUTS[weights.input].text,
         "input": INPUTS["torch"].text,
     }
     return tabulate(rows.items(), tablefmt="plain", disable_numparse=True)
+
+
+def _statistics(arrays: dict[str, np.ndarray]) -> str:
+    """What the running means and variances are."""
+    if has_statistics(arrays):
+        return "measured"
+    return "0 and 1: " + ("a network before training" if is_untrained(arrays) else "none, gamma and beta hold them")
 
 
 def _left_out(weights: Weights) -> str:

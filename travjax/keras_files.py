@@ -76,19 +76,21 @@ def _opened(source: Path | io.BytesIO, kind: str, layer_names: dict[str, str], h
 
 
 def _stored(item, name: str, kind: str) -> Stored:
-    """A data set, once it is known to lie in the file, whole."""
+    """A data set, once it is known to lie in the file."""
     with reading(kind):
         elsewhere = item.is_virtual or item.external is not None  # before its shape, for which HDF5 looks elsewhere
     if elsewhere:
         raise InputError(f"{shown(name)} lies in other files: must be in this one, others are not opened")
     with reading(kind):
-        shape, dtype, chunks, taken = item.shape, item.dtype, item.chunks, item.id.get_storage_size()
-    if shape is None or math.prod(shape) and not taken:
-        raise InputError(f"{shown(name)} = {list(shape or [])}: must have values, of which the file holds none")
-    if chunks and math.prod(chunks) * dtype.itemsize > LARGEST_CHUNK:
-        raise InputError(f"{shown(name)} in chunks of {list(chunks)}: must be of at most {LARGEST_CHUNK:,} bytes")
+        shape, dtype = item.shape or (), item.dtype
 
     def read() -> np.ndarray:
+        with reading(kind):
+            chunk, taken = math.prod(item.chunks or ()) * dtype.itemsize, item.id.get_storage_size()
+        if not taken:
+            raise InputError(f"{shown(name)} = {list(shape)}: must have values, of which the file holds none")
+        if chunk > LARGEST_CHUNK:
+            raise InputError(f"{shown(name)} in chunks of {chunk:,} bytes: must be at most {LARGEST_CHUNK:,}")
         with reading(kind):
             return as_named(np.asarray(item[()]))
 

@@ -71,6 +71,17 @@ def _hugging_face_name(layer: str, array: str) -> str:
     return f"resnet.{place}." + ("convolution.weight" if array == "kernel" else f"normalization.{_TORCHVISION[array]}")
 
 
+def _detectron_name(layer: str, array: str) -> str:
+    """Of the ResNet of facebookresearch/detectron2, whose classifier is called `linear`."""
+    if layer == "fc1000":
+        return "linear.weight" if array == "kernel" else "linear.bias"
+    place = "stem.conv1"
+    if layer != "conv1":
+        stage, index, number = _position(layer)
+        place = f"res{stage}.{index}.{f'conv{number}' if number else 'shortcut'}"
+    return f"{place}.weight" if array == "kernel" else f"{place}.norm.{_TORCHVISION[array]}"
+
+
 def _keras_name(layer: str, array: str) -> str:
     if layer == "fc1000":
         return f"predictions/{array}"
@@ -96,6 +107,7 @@ NAMINGS = (
     Naming("torchvision", _torchvision_name, stride_in="3x3", by_output=True),
     Naming("Hugging Face", _hugging_face_name, stride_in="3x3", by_output=True),
     Naming("Hugging Face", _bare_hugging_face_name, stride_in="3x3", by_output=True),
+    Naming("Detectron2", _detectron_name, by_output=True, input="caffe"),
     Naming("Keras", _keras_name, epsilon=1.001e-5, biased=True, input="caffe"),
     # Of 2016 to 2018, when Keras left epsilon at its default, with which these weights are the most accurate if the
     # pool is padded: github.com/keras-team/keras-applications/issues/8.
@@ -151,7 +163,7 @@ def recognised(
         raise InputError(
             f"no array of a ResNet among its {len(found)}{under}; allowed names are, for the first: {known}"
         )
-    if len(ties) > 1:
+    if len(ties) > 1 and 2 * count > len(shapes):  # else it is none of them, and what is missing is said
         several = ", ".join(shown(repr(tie)) for tie in ties[:4])
         raise InputError(f"holds {len(ties)} networks, whose names begin with {several}: --prefix must say which")
     return _sorted_out(found, naming, start, shapes)
@@ -184,12 +196,12 @@ def _sorted_out(
 
 
 def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], naming: Naming, top: dict) -> bool:
-    """Whether the top layer is one of another number of classes."""
+    """Whether the top layer is one of another number of classes, or without a bias."""
     kernel, bias = (found.get(in_file(name)) for name in top)
-    if kernel is None or bias is None or len(kernel.shape) != 2:
+    if kernel is None or len(kernel.shape) != 2:
         return False
     features, classes = kernel.shape[::-1] if naming.by_output else kernel.shape
-    return features == top["fc1000/kernel"][0] and classes != CLASSES and bias.shape == (classes,)
+    return features == top["fc1000/kernel"][0] and (classes != CLASSES or bias is None)
 
 
 def _are_heads(shapes: list[tuple[int, ...]], features: int) -> bool:

@@ -82,9 +82,10 @@ def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.
 
 
 def has_statistics(arrays: dict[str, np.ndarray]) -> bool:
-    """Whether any running mean is not 0 or any running variance not 1."""
-    every = {"mean": 0, "var": 1}
-    return any((array != every[kind]).any() for kind, array in _of_kinds(arrays, *every))
+    """Whether any running mean is not 0 or any running variance not 1, or 1 less an epsilon, as Detectron2 has it."""
+    nearly = {"mean": (0, 0), "var": (1, 2e-5)}
+    off = [np.abs(array - nearly[kind][0]).max() > nearly[kind][1] for kind, array in _of_kinds(arrays, *nearly)]
+    return any(off)
 
 
 def is_untrained(arrays: dict[str, np.ndarray]) -> bool:

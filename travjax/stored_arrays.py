@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import ml_dtypes
+import jax.numpy as jnp
 import numpy as np
 
 from travjax.config import InputError
@@ -86,7 +86,7 @@ def type_name(dtype: np.dtype) -> str:
 
 def as_named(array: np.ndarray) -> np.ndarray:
     """The array as `type_name` calls it."""
-    return array.view(ml_dtypes.bfloat16) if type_name(array.dtype) == "bfloat16" else array
+    return array.view(jnp.bfloat16) if type_name(array.dtype) == "bfloat16" else array
 
 
 def open_zip(path: Path, kind: str) -> zipfile.ZipFile:

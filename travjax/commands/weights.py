@@ -19,9 +19,9 @@ def add(commands: options.Commands) -> None:
         "weights",
         help="convert ImageNet weights of a ResNet50",
         description="Checks ImageNet weights of a ResNet50 name by name and shape by shape, says what they are, and "
-        "writes them as DIR/resnet50.safetensors. Names may be those of torchvision, Hugging Face or Keras, after any "
-        "prefix (state_dict.module.); only the trunk is needed, other heads are left out. Not read are pickles of "
-        "arrays (.pkl), weights in several files, .onnx, .msgpack, and files of TensorFlow.",
+        "writes them as DIR/resnet50.safetensors. Names may be those of torchvision, Hugging Face, Detectron2 or "
+        "Keras, after any prefix (state_dict.module.); only the trunk is needed, other heads are left out. Not read "
+        "are pickles of arrays (.pkl), weights in several files, .onnx, .msgpack, and files of TensorFlow.",
     )
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument(
@@ -45,13 +45,13 @@ def add(commands: options.Commands) -> None:
         metavar="I",
         help="pixels that the weights are made for, which names do not say: torch, R, G, B, (x / 255 - mean) / std; "
         "caffe, B, G, R, x - mean from 0 to 255; torch-bgr, caffe-rgb; tf, R, G, B from -1 to 1; unit, from 0 to 1 "
-        "(caffe under the names of Keras, else torch)",
+        "(caffe under the names of Keras and Detectron2, else torch)",
     )
     parser.add_argument(
         "--stride-in",
         choices=["1x1", "3x3"],
         help="the convolution that has the strides: 1x1 (v1), as in most that were made from Caffe's, or 3x3 (v1.5) "
-        "(3x3 under the names of torch, else 1x1)",
+        "(3x3 under the names of torchvision and Hugging Face, else 1x1)",
     )
     parser.add_argument(
         "--prefix", metavar="P", help="what names begin with, where a file holds several networks (state_dict_ema.)"
