@@ -8,6 +8,7 @@ import dataclasses
 import hashlib
 import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -180,7 +181,7 @@ class Dataset:
     @cached_property
     def fingerprint(self) -> str:
         """Tells data sets apart: a hash of labels, seeds, groups and splits, and of heights and places of real maps."""
-        digest = hashlib.sha256("\n".join(self.group).encode())
+        digest = hashlib.sha256("\n".join(self.group).encode(errors="surrogatepass"))
         places = [] if self.config else [self.heights, *(self.provenance.arrays.values() if self.provenance else ())]
         for array in (self.labels, self.seed, self.split, *places):
             digest.update(np.ascontiguousarray(array).data)
@@ -291,9 +292,12 @@ def _files_of(table: dict[str, Any], names: Sequence[str], path: Path) -> dict[s
 
 def _read_array(path: Path) -> np.ndarray:
     try:
-        array = np.load(path, allow_pickle=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that are not NumPy's own
+            array = np.load(path, allow_pickle=False)
     except Exception as error:  # NumPy raises all sorts over what is no array
-        raise InputError(f"{path}: cannot be read as an array: {str(error) or type(error).__name__}") from None
+        reason = str(error).partition(". ")[0] or type(error).__name__
+        raise InputError(f"{path}: cannot be read as an array: {reason}") from None
     require(isinstance(array, np.ndarray), str(path), type(array).__name__, "a .npy file of one array")
     return array
 
