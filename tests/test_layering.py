@@ -27,6 +27,7 @@ ORDER = [
     "labelling",
     "sampling",
     "provenance",
+    "dataset_json",
     "dataset",
     "sites",
     "tfds_builder",
