@@ -13,6 +13,7 @@ import pytest
 from conftest import SETTINGS
 
 from travjax import dataset as module
+from travjax import dataset_json
 from travjax.actions import ActionSpace
 from travjax.config import InputError
 from travjax.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, require_same
@@ -456,7 +457,7 @@ def changed_table(folder: Path, **changes) -> None:
     """Changes dataset.json as another version of travjax might have written it, its checksum included."""
     path = folder / "dataset.json"
     table = {key: value for key, value in json.loads(path.read_text()).items() if key != "sha256"} | changes
-    path.write_text(json.dumps(table | {"sha256": module._digest(table)}))
+    path.write_text(json.dumps(table | {"sha256": dataset_json.digest(table)}))
 
 
 def changed_array(folder: Path, name: str, array: np.ndarray) -> None:

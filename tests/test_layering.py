@@ -39,6 +39,7 @@ ORDER = [
     "labelling",
     "sampling",
     "provenance",
+    "dataset_json",
     "dataset",
     "sites",
     "tfds_builder",

@@ -13,7 +13,7 @@ import pytest
 from test_dataset import placed_maps
 from training import run_of
 
-from travjax import dataset
+from travjax import dataset_json
 from travjax.actions import ActionSpace
 from travjax.config import InputError, from_json, to_json
 from travjax.dataset import Dataset, is_dataset, load, save
@@ -128,7 +128,7 @@ def with_checksum(table: dict) -> str:
     """A dataset.json as another program might write it, with a checksum wherever there is one."""
     described = {key: value for key, value in table.items() if key != "sha256"}
     try:
-        described |= {"sha256": dataset._digest(described)}
+        described |= {"sha256": dataset_json.digest(described)}
     except ValueError:  # of a number that is not finite
         described |= {"sha256": "none"}
     return json.dumps(described)

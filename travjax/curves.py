@@ -10,6 +10,7 @@ from itertools import cycle, pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
+from travjax.config import one_line
 from travjax.grid import Grid
 from travjax.metrics import NAMES, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
 from travjax.transfer_scores import Results
@@ -168,7 +169,7 @@ def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
             ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
         always = results.always(site)
         ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
-        ax.set_title(f"{site}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
+        ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
         ax.set(xlabel="epoch on real maps", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")

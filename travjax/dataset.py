@@ -8,7 +8,8 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -27,9 +28,9 @@ from travjax.config import (
     read_json,
     require,
     require_number,
-    shown,
     to_json,
 )
+from travjax.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, read_table
 from travjax.files import folder_written_whole, put_back, sha256, user_path
 from travjax.footprint import node_table
 from travjax.grid import Grid
@@ -38,8 +39,6 @@ from travjax.robot import Robot
 from travjax.sampling import UNKNOWN, random_keys
 from travjax.terrain import STYLES, generate_terrain, require_world
 from travjax.traverse import failures, packed, simulate
-
-FORMAT, FORMAT_VERSION = "travjax data set", 1
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
 """Each is a file of its own, `heights.npy` and so on; real maps have PROVENANCE_ARRAYS as well."""
@@ -181,7 +180,7 @@ class Dataset:
     @cached_property
     def fingerprint(self) -> str:
         """Tells data sets apart: a hash of labels, seeds, groups and splits, and of heights and places of real maps."""
-        digest = hashlib.sha256("\n".join(self.group).encode())
+        digest = hashlib.sha256("\n".join(self.group).encode(errors="surrogatepass"))
         places = [] if self.config else [self.heights, *(self.provenance.arrays.values() if self.provenance else ())]
         for array in (self.labels, self.seed, self.split, *places):
             digest.update(np.ascontiguousarray(array).data)
@@ -256,7 +255,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
         arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
-        (temporary / "dataset.json").write_text(json.dumps(table | {"sha256": _digest(table)}, indent=1) + "\n")
+        (temporary / "dataset.json").write_text(json.dumps(table | {"sha256": digest(table)}, indent=1) + "\n")
 
 
 def load(folder: str | Path) -> Dataset:
@@ -269,10 +268,10 @@ def load(folder: str | Path) -> Dataset:
     put_back(folder)
     require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
     path = folder / "dataset.json"
-    table = _read_table(path)
+    table = read_table(path)
     names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
-    for name, (size, digest) in _files_of(table, names, path).items():
-        _verify(folder / name, size, digest)
+    for name, (size, checksum) in files_of(table, names, path).items():
+        _verify(folder / name, size, checksum)
     arrays = {name: _read_array(folder / f"{name}.npy") for name in names}
     try:
         with naming(folder):
@@ -281,37 +280,16 @@ def load(folder: str | Path) -> Dataset:
         raise InputError(f"{folder}: {error}") from None
 
 
-def _files_of(table: dict[str, Any], names: Sequence[str], path: Path) -> dict[str, tuple[int, str]]:
-    """Size and checksum of the file of each array, as dataset.json has them."""
-    told, expected = table.get("files"), [f"{name}.npy" for name in names]
-    files = told if isinstance(told, dict) else {}
-    require(files.keys() == set(expected), f"{path}: files", told, f"a table of {', '.join(expected)}")
-    for name, file in files.items():
-        both = isinstance(file, dict) and type(file.get("bytes")) is int and isinstance(file.get("sha256"), str)
-        require(both, f"{path}: files.{name}", file, "a table with bytes and sha256")
-    return {name: (file["bytes"], file["sha256"]) for name, file in files.items()}
-
-
 def _read_array(path: Path) -> np.ndarray:
     try:
-        array = np.load(path, allow_pickle=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that are not NumPy's own
+            array = np.load(path, allow_pickle=False)
     except Exception as error:  # NumPy raises all sorts over what is no array
-        raise InputError(f"{path}: cannot be read as an array: {str(error) or type(error).__name__}") from None
+        reason = str(error).partition(". ")[0] or type(error).__name__
+        raise InputError(f"{path}: cannot be read as an array: {reason}") from None
     require(isinstance(array, np.ndarray), str(path), type(array).__name__, "a .npy file of one array")
     return array
-
-
-def _read_table(path: Path) -> dict[str, Any]:
-    table = read_json(path)
-    if not isinstance(table, dict) or table.get("format") != FORMAT:
-        raise InputError(f"{path}: not the description of a {FORMAT}")
-    if table.get("version") != FORMAT_VERSION:
-        raise InputError(
-            f"{path}: format version {shown(table.get('version'))}: must be {FORMAT_VERSION}; make it again"
-        )
-    if table.pop("sha256", None) != _digest(table):
-        raise InputError(f"{path}: has been altered: its checksum differs")
-    return table
 
 
 def _verify(path: Path, size: int, expected: str) -> None:
@@ -347,10 +325,6 @@ def _write(path: Path, array: np.ndarray, on_progress: Progress | None) -> dict[
         hashing = _Hashing(file, on_progress)
         np.lib.format.write_array(hashing, array, allow_pickle=False)
     return {"bytes": hashing.bytes, "sha256": hashing.sha256.hexdigest()}
-
-
-def _digest(table: dict[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(table, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
 
 def is_dataset(folder: Path) -> bool:

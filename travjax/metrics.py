@@ -144,16 +144,6 @@ class Calibration:
         return np.linspace(0, 1, len(self.count) + 1)
 
     @property
-    def mean_probability(self) -> float:
-        """Of all samples."""
-        return float(np.nansum(self.count * self.probability) / self.count.sum())
-
-    @property
-    def frequency(self) -> float:
-        """Of failures among all samples."""
-        return float(np.nansum(self.count * self.observed) / self.count.sum())
-
-    @property
     def error(self) -> float:
         """The expected calibration error (ECE): mean distance of probability and observed share over the samples."""
         distance = np.abs(self.probability - self.observed)

@@ -108,12 +108,15 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
 
 def calibration_line(evaluation: Evaluation) -> str:
     """One line: mean probability and measured frequency of failures, and whether probabilities are too high or low."""
-    bins = evaluation.calibration
-    means = [f"{name} {bins[name].mean_probability:.4f} ({bins[name].frequency:.4f})" for name in NAMES]
-    overall = bins[OVERALL]
-    ratio = overall.mean_probability / overall.frequency if overall.frequency else math.inf
+    over = lambda bins, values: float(np.nansum(bins.count * values) / bins.count.sum())
+    pairs = {
+        name: (over(bins, bins.probability), over(bins, bins.observed)) for name, bins in evaluation.calibration.items()
+    }
+    means = [f"{name} {mean:.4f} ({frequency:.4f})" for name, (mean, frequency) in pairs.items()]
+    mean, frequency = pairs[OVERALL]
+    ratio = mean / frequency if frequency else math.inf
     verdict = "too high" if ratio > 1 + TOLERANCE else "too low" if ratio < 1 - TOLERANCE else "right"
-    times = f"{ratio:.2f} times the frequency" if overall.frequency else "no sample fails"
+    times = f"{ratio:.2f} times the frequency" if frequency else "no sample fails"
     return (
         f"Calibration, mean probability and in brackets the measured frequency of failures: {', '.join(means)}. "
         f"Overall the probabilities are {verdict} on average, {times}; reliability.png shows them by bin."

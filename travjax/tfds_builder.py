@@ -10,7 +10,6 @@ its terrain; `map`, its index in the data set; of a real map `origin` and `quart
 is not an array is in the builder's metadata.
 """
 
-import json
 import shutil
 import warnings
 from collections.abc import Callable
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax.config import InputError, require
+from travjax.config import InputError, read_json, require
 from travjax.dataset import SPLITS, Dataset, configs_to_json, put_together
 from travjax.files import folder_written_whole, put_back, user_path
 
@@ -151,9 +150,10 @@ def _example(dataset: Dataset, index: int) -> dict[str, Any]:
 def _is_export(folder: Path) -> bool:
     """Whether the folder holds an exported data set and nothing else."""
     try:
-        metadata = json.loads((folder / NAME / VERSION / METADATA).read_text())
-        return "travjax" in metadata and [path.name for path in folder.iterdir()] == [NAME]
-    except (OSError, ValueError, TypeError):
+        metadata = read_json(folder / NAME / VERSION / METADATA)
+        described = isinstance(metadata, dict) and "travjax" in metadata
+        return described and [path.name for path in folder.iterdir()] == [NAME]
+    except (OSError, InputError):
         return False
 
 

@@ -21,7 +21,7 @@ import optax
 
 from travjax import metrics, progress
 from travjax.checkpoint import Checkpoints
-from travjax.config import InputError, require
+from travjax.config import InputError, one_line, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import VARIABLES, take_apart
 from travjax.files import held
@@ -126,7 +126,7 @@ class Trainer:
         require(trained_on == given, "data set", given, f"{trained_on}, the one that the run was trained on so far")
         self.position = Position(**meta["position"])
         for notice in self.checkpoints.notices:
-            self._say(notice)
+            self._say(one_line(notice))
         here = self.position
         self._say(f"goes on from step {here.total}: phase {here.phase}, epoch {here.epoch + 1}, batch {here.step + 1}")
 
