@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from travjax.config import InputError, require, require_number
-from travjax.grid import HIGHEST, Grid
+from travjax.grid import HIGHEST, MARKERS, Grid
 
 FILL_DISTANCE = 0.125
 """Metres: a hole is filled when each of its nodes is this near to known ground."""
@@ -19,9 +19,6 @@ COARSEST = 0.125
 
 LOWEST = -12_000.0
 """Metres: what is deeper is no height; HIGHEST is in grid.py."""
-
-MARKERS = (-9999, -99999, -32768, 9999)
-"""Usual marks of unknown ground that some files do not declare."""
 
 
 @dataclass(frozen=True)
