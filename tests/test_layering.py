@@ -10,8 +10,12 @@ import travjax
 ORDER = [
     "config",
     "models",
+    "flags",
+    "rounding",
     "files",
+    "arrays",
     "grid",
+    "heights",
     "batching",
     "noise",
     "terrain",

@@ -19,6 +19,7 @@ from travjax.config import InputError, from_json, require, to_json
 from travjax.estimator import Estimator, put_together, take_apart
 from travjax.field import HazardField
 from travjax.files import written_whole
+from travjax.flags import usual_flags
 from travjax.grid import Grid
 from travjax.imagenet import Weights
 from travjax.inputs import ImageSource
@@ -90,6 +91,7 @@ class Run:
             if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {others!r}: must be {mine!r}, as in the run so far")
 
+    @usual_flags()
     def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
         """An estimator with random parameters, or a ResNet with a trunk of `weights`.
 
@@ -109,10 +111,12 @@ class Run:
             return MapSource.of(heights, self.robot, self.actions, self.grid, scale)
         return ImageSource.of(heights, self.robot, self.actions, self.grid, scale, on_progress)
 
+    @usual_flags()
     def graph(self) -> nnx.GraphDef:
         """What is fixed of the estimator."""
         return take_apart(nnx.eval_shape(self.create))[0]
 
+    @usual_flags()
     def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
         """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
 
@@ -142,15 +146,18 @@ def has_checkpoints(folder: Path) -> bool:
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
+@usual_flags()
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
-    Raises InputError when there is none or it is damaged.
+    Raises InputError when there is none, or it is damaged or not made of finite numbers.
     """
     run = Run.load(folder)
     checkpoints = Checkpoints(Path(folder) / "checkpoints")
     state, meta = checkpoints.restore(lambda meta: run.template(meta["optimizer"]), which)
     for notice in checkpoints.notices:
         print(notice)
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
+        raise InputError(f"{folder}: checkpoint {which!r} holds NaN or infinite weights; allowed: another checkpoint")
     return run, put_together(run.graph(), state), meta
