@@ -33,8 +33,11 @@ def guarded(work: Callable[[], object]) -> int:
     """Does the work of a program; returns the exit code, 2 for bad input, which is said in one line."""
     import jax
 
+    from travjax.flags import usual_flags
+
     try:
-        work()
+        with usual_flags():
+            work()
     except InputError as error:
         print(f"travjax: {error}", file=sys.stderr)
         return 2
