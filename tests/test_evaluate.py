@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import field_runs
 import numpy as np
 import pytest
 from commandline import FEW
@@ -183,3 +184,12 @@ def test_scores_are_by_event_and_by_style(evaluator):
         confusion = inner["step"].confusion
         assert confusion.samples == (styles == style).sum()
         assert confusion.tp + confusion.fn == failed[styles == style, 0].sum()
+
+
+def test_a_data_set_whose_labels_say_known_where_its_map_is_unknown_is_refused():
+    data = field_runs.dataset()
+    heights = np.array(data.heights)
+    heights[data.maps_of("test")[0], : GRID.nodes // 2] = np.nan
+    spoilt = Evaluator.of(field_runs.RUN, replace(data, heights=heights), Devices.all())
+    with pytest.raises(InputError, match="^data set, margins = 'NaN': must be known trajectories alone"):
+        spoilt.margins(field_runs.estimator(), spoilt.samples(0, 0))

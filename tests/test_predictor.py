@@ -1,6 +1,7 @@
 """Probabilities from maps alone: those of the evaluation, of any heights that label takes; the packaged estimator."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -8,15 +9,16 @@ import numpy as np
 import pytest
 from commandline import FEW
 from field_runs import RUN, begun, estimator
-from training import GRID, HUSKY, dataset, run_of
+from training import GRID, HUSKY, copy, dataset, run_of
 from training import estimator as resnet
 
 import travjax
 from travjax import metrics
 from travjax.actions import ActionSpace
+from travjax.checkpoint import Checkpoints
 from travjax.config import InputError
 from travjax.corruption import filled
-from travjax.estimator import take_apart
+from travjax.estimator import put_together, take_apart
 from travjax.evaluate import Evaluator
 from travjax.map_data import MapSource
 from travjax.model_file import write_model
@@ -144,6 +146,46 @@ def test_a_map_alone_and_one_of_many_are_the_same(tiny):
         for part in ("probability", "margins"):
             np.testing.assert_allclose(getattr(one, part), getattr(many, part)[index], atol=1e-5)
             np.testing.assert_allclose(getattr(batch, part)[0], getattr(many, part)[index], atol=1e-5)
+
+
+# ---- Damage never says "safe"
+
+
+def spoilt(network, value: float, part: str):
+    """The estimator with one weight set to a value."""
+    graph, variables = take_apart(network)
+    leaves, structure = jax.tree.flatten(variables[part])
+    leaves[0] = leaves[0].at[(0,) * leaves[0].ndim].set(value)
+    return put_together(graph, variables | {part: jax.tree.unflatten(structure, leaves)})
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("part", ["trunk", "heads"])
+def test_an_estimator_that_puts_out_no_numbers_is_refused(value, part):
+    for run, network, maps in ((RUN, estimator(), 2), (run_of(), resnet(), 1)):
+        broken = Predictor(run, spoilt(network, value, part), Path("runs/broken"))
+        heights = dataset().heights[:maps]
+        message = refusal(broken.predict, heights)
+        assert message.startswith("runs/broken: the estimator puts out NaN or infinity; allowed: ")
+        assert refusal(replace(broken, source=None).predict, heights) == message.removeprefix("runs/broken: ")
+
+
+def test_a_checkpoint_of_no_numbers_is_refused(field, tmp_path):
+    folder = copy(field, tmp_path / "run")
+    checkpoints = Checkpoints(folder / "checkpoints")
+    state, meta = checkpoints.restore(lambda meta: RUN.template(meta["optimizer"]))
+    leaves, structure = jax.tree.flatten(state)
+    leaves[0] = np.full_like(leaves[0], np.nan)
+    checkpoints.save(99, jax.tree.unflatten(structure, leaves), meta)
+    message = refusal(Predictor.load, folder, "latest")
+    assert message == f"{folder}: checkpoint 'latest' holds NaN or infinite weights; allowed: another checkpoint"
+    Predictor.load(folder)  # the best one is whole
+
+
+def test_where_an_estimator_comes_from_is_kept(field, tiny):
+    assert Predictor.load(field).source == field
+    assert Predictor.load().source == WEIGHTS / f"{DEFAULT}.safetensors"
+    assert tiny.source is None
 
 
 # ---- Heights

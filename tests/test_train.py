@@ -536,6 +536,13 @@ def test_a_state_that_is_no_number_is_never_the_latest_checkpoint(tmp_path):
     assert all(np.isfinite(array).all() for array in saved_state(tmp_path).values())
 
 
+@pytest.mark.parametrize("head_epochs", [1, 0])
+def test_a_validation_of_no_numbers_stops_training(tmp_path, head_epochs):
+    made = begun(tmp_path, head_epochs=head_epochs)
+    made.state["heads"] = jax.tree.map(lambda array: array * float("nan"), made.state["heads"])
+    assert refusal(made._validated).startswith("a validation logit that is no number in batch 0 of phase")
+
+
 def test_a_full_disk_stops_training_and_keeps_the_earlier_checkpoints(tmp_path, monkeypatch):
     made = begun(tmp_path)
     save, saves = made.checkpoints.save, []

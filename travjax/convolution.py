@@ -156,7 +156,8 @@ def _max_pool_forward(images):
 def _max_pool_backward(saved, gradient):
     """Each pixel gathers from the up to four windows that it lies in."""
     place, (rows, cols) = saved
-    row, col = jnp.arange(rows)[:, None, None], jnp.arange(cols)[:, None]
+    row = jnp.arange(rows, dtype=jnp.int32)[:, None, None]
+    col = jnp.arange(cols, dtype=jnp.int32)[:, None]
     total = jnp.zeros((len(gradient), rows, cols, gradient.shape[-1]), gradient.dtype)
     for below in (0, 1):
         for right in (0, 1):

@@ -58,7 +58,10 @@ def guarded(work: Callable[[], object]) -> int:
     settle_streams()
     with signals.raised():
         try:
-            work()
+            from travjax.flags import usual_flags  # imports JAX, which takes a second
+
+            with usual_flags():
+                work()
             sys.stdout.flush()
         except InputError as error:
             return _ended(2, str(error))

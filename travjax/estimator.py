@@ -9,6 +9,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from travjax.config import require, require_number
+from travjax.flags import key_of, usual_flags
 from travjax.imagenet import Weights, apply_weights
 from travjax.resnet import ResNet, ResNetConfig
 from travjax.traverse import EVENTS
@@ -90,6 +91,7 @@ class Estimator(nnx.Module):
         return self.heads(features, key)
 
 
+@usual_flags()
 def create(
     trunk: ResNetConfig = ResNetConfig(),
     heads: HeadsConfig = HeadsConfig(),
@@ -100,13 +102,13 @@ def create(
 
     Raises InputError when the weights are those of another trunk.
     """
-    make = lambda: ResNet(trunk, rngs=nnx.Rngs(seed))
+    make = lambda: ResNet(trunk, rngs=nnx.Rngs(key_of(seed)))
     if weights is None:
         body = make()
     else:
         body = nnx.eval_shape(make)  # random numbers for a whole trunk take ten seconds to compile
         apply_weights(body, weights)
-    return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(seed + 1)))
+    return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(key_of(seed + 1))))
 
 
 def take_apart(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:

@@ -85,6 +85,7 @@ class Evaluator:
         """Predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
 
         Both are cut off where training does not tell them apart any more. on_progress: is told of maps
+        Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
         """
         graph, variables = take_apart(network)
         maps, place = np.unique(samples[0], return_inverse=True)
@@ -93,6 +94,8 @@ class Evaluator:
         run = self.run
         simulated = simulate(self.dataset.heights[maps], run.robot, run.actions, grid=run.grid).events()
         true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
+        allowed = "known trajectories alone, as its labels say"
+        require(bool(np.isfinite(true).all()), "data set, margins", "NaN", allowed)
         return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], 3:], true))  # type: ignore
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from travjax.config import require, require_number
 from travjax.convolution import convolve
+from travjax.flags import key_of, usual_flags
 from travjax.resnet import ConvNorm
 from travjax.stencil import PLACES, Stencil
 from travjax.traverse import EVENTS
@@ -128,7 +129,7 @@ class PoseHead(nnx.Module):
         self.bias = nnx.Param(jnp.zeros(hidden, jnp.float32))
         self.second = nnx.Linear(hidden, hidden, kernel_init=_he_normal, rngs=rngs)
         self.hazard = nnx.Linear(hidden, outputs, rngs=rngs)
-        self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0]), len(EVENTS)))
+        self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0], jnp.float32), len(EVENTS)))
 
     def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b 6"]:
         """Three logits, then three margins in units of the robot's limits.
@@ -178,9 +179,11 @@ def read_out(hazard: Float[Array, "f p b 6"], stencil: Stencil) -> tuple[Float[A
     return by_map(logits), by_map(margins)
 
 
+@usual_flags()
 def create(config: FieldConfig = FieldConfig(), seed: int = 0) -> HazardField:
     """An estimator with random parameters."""
-    return HazardField(UNet(config, rngs=nnx.Rngs(seed)), PoseHead(config, rngs=nnx.Rngs(seed + 1)))
+    trunk, heads = (nnx.Rngs(key_of(number)) for number in (seed, seed + 1))
+    return HazardField(UNet(config, rngs=trunk), PoseHead(config, rngs=heads))
 
 
 def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:

@@ -14,6 +14,9 @@ from travjax.config import require, require_length, require_number
 HIGHEST = 30_000.0
 """Metres: what is higher, or as deep, is no height."""
 
+MARKERS = (-9999, -99999, -32768, 9999)
+"""Usual marks of unknown ground that some files and arrays do not declare."""
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -54,3 +57,8 @@ class Grid:
     def axis(self) -> np.ndarray:
         """Coordinates of the rows (y) or columns (x): [nodes] float64 metres."""
         return (np.arange(self.nodes) - 0.5 * self.cells) * self.spacing
+
+
+def require_grid(grid: object) -> None:
+    """Raises InputError unless it is a Grid."""
+    require(isinstance(grid, Grid), "grid", grid, "a travjax.Grid, such as Grid(size=8, spacing=0.0625)")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from travjax.raster import Heights, parts
+from travjax.raster import HeightSource, parts
 
 FILL_DISTANCE = 0.125
 """Metres: a hole is filled when each of its cells is this near to known ground, or one cell where that is more."""
@@ -21,7 +21,7 @@ class SmallHoles:
     count: of these cells
     """
 
-    def __init__(self, heights: Heights, cell_size: float):
+    def __init__(self, heights: HeightSource, cell_size: float):
         """Reads the heights through, twice if any is unknown."""
         self._cols, self._distance = heights.shape[1], max(FILL_DISTANCE, cell_size) + 1e-9
         self._packed: dict[int, np.ndarray] = {}  # of the rows that have any, a bit a cell
@@ -46,7 +46,7 @@ class SmallHoles:
 class _Holes:
     """Groups of unknown cells that touch, be it at a corner, over all parts in which a raster is read."""
 
-    def __init__(self, heights: Heights, cell_size: float, distance: float):
+    def __init__(self, heights: HeightSource, cell_size: float, distance: float):
         self.heights, self.cell_size, self.distance = heights, cell_size, distance
 
     def small(self):

@@ -21,6 +21,7 @@ from tabulate import tabulate
 
 from travjax.config import InputError, require
 from travjax.files import user_path
+from travjax.flags import key_of
 from travjax.namings import CLASSES, Recognised, recognised
 from travjax.namings import NAMINGS as _NAMINGS
 from travjax.preprocessing import INPUTS, converted, has_statistics, is_untrained, require_fit, require_statistics
@@ -131,7 +132,7 @@ def _variables(resnet: ResNet) -> dict[str, nnx.Variable]:
 @lru_cache
 def _shapes(config: ResNetConfig) -> dict[str, tuple[int, ...]]:
     """Canonical names and shapes of a network's arrays, with those of the top layer."""
-    resnet = nnx.eval_shape(lambda: ResNet(config, rngs=nnx.Rngs(0)))
+    resnet = nnx.eval_shape(lambda: ResNet(config, rngs=nnx.Rngs(key_of(0))))
     shapes = {name: variable.shape for name, variable in _variables(resnet).items()}
     return shapes | {"fc1000/kernel": (config.features, CLASSES), "fc1000/bias": (CLASSES,)}
 

@@ -23,12 +23,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from travjax.actions import ActionSpace
+from travjax.arrays import integers
 from travjax.config import InputError, require, require_number
 from travjax.files import cache_folder, save_npz
+from travjax.flags import usual_flags
 from travjax.footprint import node_table
 from travjax.grid import HIGHEST, Grid
+from travjax.heights import Heights, as_maps
 from travjax.robot import Robot
-from travjax.traverse import Heights, as_maps, chosen_robot
+from travjax.traverse import chosen_actions, chosen_robot
 
 CHANNELS = ("elevation", "trajectory", "wheels")
 
@@ -45,6 +48,7 @@ CHUNK = 16
 """Arcs drawn at once: their distances fit in the second-level cache."""
 
 
+@usual_flags()
 def render_inputs(
     heights: Heights,
     map_index,
@@ -67,10 +71,10 @@ def render_inputs(
     Raises InputError as `simulate` does, for indices that are no integers or out of range, and for a scale that is not
     above 0.
     """
-    robot, actions = chosen_robot(robot), actions or ActionSpace()
+    maps, _ = as_maps(heights, grid)
+    robot, actions = chosen_robot(robot), chosen_actions(actions)
     require_number("elevation_scale", elevation_scale, 0, np.inf, "a length in metres above 0")
     node_table(robot, actions, grid)  # refuses what does not fit together
-    maps = as_maps(heights, grid)
     of_map = _checked_index("map_index", map_index, len(maps))
     of_trajectory = _checked_index("trajectory_index", trajectory_index, len(actions))
     if of_map.ndim and of_trajectory.ndim and of_map.shape != of_trajectory.shape:
@@ -85,11 +89,10 @@ def render_inputs(
 
 
 def _checked_index(name: str, index, count: int) -> np.ndarray:
-    numbers = np.asarray(index)
-    whole = np.issubdtype(numbers.dtype, np.integer) and numbers.ndim < 2 and numbers.size > 0
-    inside = whole and numbers.min() >= 0 and numbers.max() < count
-    require(bool(inside), name, index, f"an integer, or a list of integers, from 0 to {count - 1}")
-    return numbers
+    allowed = f"an integer, or a list of integers, from 0 to {count - 1}"
+    numbered = integers(name, index, allowed, 0, count - 1)
+    require(numbered.ndim < 2, name, index, allowed)
+    return numbered
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["heights", "bank", "elevation_scale"], meta_fields=[])
@@ -145,7 +148,8 @@ def elevation_channel(
     """
     rows, cols = heights.shape[1:]
     flat = heights.reshape(len(heights), -1)
-    y, x = jnp.arange(rows)[:, None] - rows // 2, jnp.arange(cols) - cols // 2
+    y = jnp.arange(rows, dtype=jnp.int32)[:, None] - rows // 2
+    x = jnp.arange(cols, dtype=jnp.int32) - cols // 2
     distance = (x * x + y * y).reshape(-1)
     known = jnp.abs(flat) <= HIGHEST
     nearest = jnp.argmin(jnp.where(known, distance, jnp.iinfo(distance.dtype).max), axis=1)
@@ -197,6 +201,7 @@ def _read_bank(path: Path, configuration: str) -> np.ndarray | None:
         return None
 
 
+@usual_flags()
 def trajectory_channels(
     robot: Robot, actions: ActionSpace, grid: Grid, trajectories: Int[np.ndarray, " k"]
 ) -> UInt8[np.ndarray, "k rows cols 2"]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from travjax.actions import ActionSpace
 from travjax.batching import BATCH
-from travjax.config import one_line
+from travjax.config import one_line, require
 from travjax.dem import Windows
 from travjax.grid import Grid
 from travjax.robot import Robot
@@ -51,8 +51,14 @@ def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
 
 
 def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Batch:
-    """The batch with `step`, `obstacle`, `tilt` and `known` [n, t] and `failed` [n, t, 3]."""
+    """The batch with `step`, `obstacle`, `tilt` and `known` [n, t] and `failed` [n, t, 3].
+
+    Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
+    """
     margins = simulate(batch["heights"], robot, actions, grid=grid)
+    numbers = np.isfinite(np.asarray(margins.events())).all(axis=-1)
+    allowed = "finite where the ground is known"
+    require(bool((numbers | ~np.asarray(margins.known)).all()), f"margins of {robot.name}", "NaN or infinity", allowed)
     arrays = dataclasses.asdict(margins) | {"failed": failures(margins, robot)}
     return batch | {name: np.asarray(array) for name, array in arrays.items()}
 

@@ -18,6 +18,7 @@ from travjax.actions import ActionSpace
 from travjax.config import require
 from travjax.corruption import corrupted, filled
 from travjax.dataset import Dataset
+from travjax.flags import usual_flags
 from travjax.footprint import views_of
 from travjax.grid import Grid
 from travjax.preset import Preset
@@ -92,6 +93,7 @@ class MapData:
         for maps, weight in zip(chosen, weights, strict=True):
             yield maps, None, weight
 
+    @usual_flags()  # in a thread of its own
     def prepared(self, maps: np.ndarray, step: int):
         """Inputs and targets of a step on maps [b], as training_step.py takes them."""
         data, preset, rng = self.dataset, self.preset, np.random.default_rng((self.config.seed, step))

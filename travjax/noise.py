@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from travjax.arrays import integers, numbers
 from travjax.config import require
+from travjax.flags import usual_flags
+from travjax.rounding import rounded
 
 SKEW = (1 / 3**0.5 - 1) / 2
 UNSKEW = (3**0.5 - 1) / 2
@@ -52,18 +55,18 @@ def permutation_table() -> jax.Array:
         return jnp.asarray(permutations(np.arange(SEEDS)))
 
 
+@usual_flags()
 def noise2(seed, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "..."]:
     """Noise in [-1, 1] at points (x, y): [...] for one integer seed, [n, ...] for n seeds.
 
     Agrees with `OpenSimplex(seed).noise2` to 1e-5 where |x|, |y| < 32. Raises InputError unless the seeds are integers.
     """
-    seeds = np.asarray(seed)
-    require(
-        np.issubdtype(seeds.dtype, np.integer) and seeds.ndim < 2, "seed", seed, "an integer, or a list of integers"
-    )
-    value = _noise_of_permutations(
-        permutations(np.atleast_1d(seeds)), jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
-    )
+    whole = "an integer, or a list of integers"
+    seeds = integers("seed", seed, whole, -(2**63), 2**63 - 1)
+    require(seeds.ndim < 2, "seed", seed, whole)
+    x, y = (values if isinstance(values, jax.Array) else numbers("x, y", values) for values in (x, y))
+    tables = permutations(np.atleast_1d(seeds))
+    value = _noise_of_permutations(tables, jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32))
     return value[0] if seeds.ndim == 0 else value
 
 
@@ -81,7 +84,7 @@ def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, " cols"], y: F
     edge = 2 * half + 1
     if edge**2 > x.size * y.size:
         return noise_at(x[None, :], y[:, None], lambda i, j: cell_codes(permutation, i, j))
-    cells = jnp.arange(-half, half + 1)
+    cells = jnp.arange(-half, half + 1, dtype=jnp.int32)
     codes = cell_codes(permutation, cells[:, None], cells[None, :]).reshape(-1)
     lookup = lambda i, j: codes.at[(i + half) * edge + j + half].get(mode="promise_in_bounds")
     return noise_at(x[None, :], y[:, None], lookup)
@@ -100,7 +103,7 @@ def cell_codes(permutation: Int[Array, "256"], i: Int[Array, "*s"], j: Int[Array
 
 def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
     """Noise at points, given a function from cell indices (i, j) to the cells' codes."""
-    skew = _rounded((x + y) * SKEW)
+    skew = rounded((x + y) * SKEW)  # else a point beside a cell's edge would lie in one cell here, in another there
     i, j = jnp.floor(x + skew), jnp.floor(y + skew)
     inside_x, inside_y = x + skew - i, y + skew - j
     code = code_of_cell(i.astype(jnp.int32), j.astype(jnp.int32))
@@ -111,16 +114,6 @@ def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
     up = jnp.where(wide, jnp.where(below, -1.0, 0.0), jnp.where(below, 1.0, 2.0))
     corners = [(a, b, 3 * bits) for bits, (a, b) in enumerate(AROUND[:4])]
     return sum(_contribution(code >> shift, dx, dy, a, b) for a, b, shift in (*corners, (right, up, outside))) / NORM
-
-
-def _rounded(product):
-    """A product that is rounded before it is added to something.
-
-    XLA repeats cheap expressions in several loops, and contracts product and sum to one operation in some of them only.
-    Beside the edge of a cell the point would be taken to lie in one cell here and in the next one there.
-    The bound is never reached, which no optimiser knows.
-    """
-    return jnp.maximum(product, -1e30)
 
 
 def _contribution(gradient, dx, dy, right, up):

@@ -9,7 +9,9 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Float
 
+from travjax.config import InputError
 from travjax.estimator import put_together
+from travjax.flags import usual_flags
 from travjax.inputs import ImageSource
 from travjax.map_data import MapSource
 from travjax.parallel import Devices
@@ -19,6 +21,13 @@ Variables = dict[str, nnx.State]
 
 MAPS = 4
 """Maps whose hazard fields a device reads at once; a map takes some 100 MB."""
+
+
+class NoNumbers(InputError):
+    """An estimator that puts out NaN or infinity: its weights are damaged, or training has diverged."""
+
+    def __init__(self):
+        super().__init__("the estimator puts out NaN or infinity; allowed: one whose weights are not damaged")
 
 
 @partial(jax.jit, static_argnames="graph")
@@ -39,6 +48,7 @@ def feature_logits(graph, variables: Variables, features: Float[Array, "b f"]):
     return put_together(graph, variables).heads(features)
 
 
+@usual_flags()
 def over_samples(
     function: Callable[..., Float[Array, "b f"]],
     graph: nnx.GraphDef,
@@ -52,6 +62,7 @@ def over_samples(
     """`sample_logits` or `sample_features` of k samples, or `map_hazards` of k maps, on the host.
 
     on_progress: is told how many samples were added
+    Raises NoNumbers when one of the results is NaN or infinite.
     """
     count = len(samples[0])
     results: list[np.ndarray] = []  # one array, filled batch by batch
@@ -63,6 +74,8 @@ def over_samples(
         while len(running) > most:
             size, result = running.pop(0)
             batch = devices.fetch(result)
+            if not np.isfinite(batch).all():
+                raise NoNumbers
             if not results:
                 results.append(np.empty((count, *batch.shape[1:]), batch.dtype))
             results[0][filled : filled + size] = batch[:size]
@@ -131,6 +144,7 @@ def hazards(
     return over_samples(map_hazards, graph, variables, source, (maps,), devices, size, on_progress)
 
 
+@usual_flags()
 def probabilities(logits: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
     """The sigmoid of logits."""
     return np.asarray(jax.nn.sigmoid(logits))

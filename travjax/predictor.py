@@ -11,15 +11,16 @@ from travjax.actions import ActionSpace
 from travjax.config import InputError, require
 from travjax.estimator import take_apart
 from travjax.files import user_path
-from travjax.grid import Grid
+from travjax.flags import usual_flags
+from travjax.grid import HIGHEST, Grid
+from travjax.heights import Heights, as_maps
 from travjax.map_data import MapSource
 from travjax.model_file import SUFFIX, read_model
 from travjax.parallel import Devices
-from travjax.prediction import hazards, logits_of, probabilities
+from travjax.prediction import NoNumbers, hazards, logits_of, probabilities
 from travjax.robot import Robot
 from travjax.sampling import Samples
 from travjax.trained import Network, Run, load_estimator
-from travjax.traverse import Heights, as_maps
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The estimators that come with the package."""
@@ -41,10 +42,11 @@ class Predicted:
 
 @dataclass(frozen=True, repr=False)
 class Predictor:
-    """A trained estimator, and the run that it comes from."""
+    """A trained estimator, the run that it comes from, and the file or folder that it was read from."""
 
     run: Run
     network: Network
+    source: Path | None = None
 
     def __repr__(self) -> str:
         run = self.run
@@ -55,6 +57,7 @@ class Predictor:
         )
 
     @staticmethod
+    @usual_flags()
     def load(source: str | Path | None = None, which: str = "best") -> "Predictor":
         """The estimator of a file, of a training run's folder, or the one that comes with the package.
 
@@ -63,10 +66,10 @@ class Predictor:
         """
         path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else user_path(source)
         if path.is_dir():
-            return Predictor(*load_estimator(path, which)[:2])
+            return Predictor(*load_estimator(path, which)[:2], path)
         if path.suffix != SUFFIX:
             raise InputError(f"{path}: no estimator; allowed: the folder of a training run, or a {SUFFIX} file")
-        return Predictor(*read_model(path)[:2])
+        return Predictor(*read_model(path)[:2], path)
 
     def require_same(self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None):
         """Raises InputError that names both when something else is given than the estimator was trained for."""
@@ -78,29 +81,39 @@ class Predictor:
         for name, given, own in (("actions", actions, run.actions), ("grid", grid, run.grid)):
             require(given in (None, own), name, given, f"{own}, which the estimator was trained for")
 
+    @usual_flags()
     def predict(self, heights: Heights, on_progress: Callable[[int], object] = lambda count: None) -> Predicted:
-        """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid.
+        """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid; heights as `simulate` takes
+        them.
 
         An unknown node counts as the nearest known one to the hazard field, and as in SPEC section 6 to the ResNet.
         on_progress: is told how many trajectories were added
-        Raises InputError when heights have another shape or are no numbers.
+        Raises InputError when `simulate` would over the heights, and when the estimator puts out NaN or infinity.
         """
-        maps, devices = np.asarray(as_maps(heights, self.run.grid)), Devices.all()
+        checked, alone = as_maps(heights, self.run.grid)
+        maps = np.asarray(checked)
+        maps = np.where(np.abs(maps) <= HIGHEST, maps, np.nan)  # those of a jax array may be anything
+        try:
+            logits, margins = self._outputs(maps, on_progress)
+        except NoNumbers as error:
+            raise InputError(f"{self.source}: {error}" if self.source else str(error)) from None
+        one = (lambda array: array[0]) if alone else (lambda array: array)
+        return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
+
+    def _outputs(self, maps: np.ndarray, on_progress: Callable[[int], object]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Logits and margins of the trajectories of maps: [n, t, 3] each, no margins of an estimator without any."""
         graph, variables = take_apart(self.network)
+        devices = Devices.all()
         variables, source = devices.replicate(variables), devices.replicate(self.run.source(maps))
         every, trajectories = np.arange(len(maps)), len(self.run.actions)
-        margins = None
         if isinstance(source, MapSource):
             told = lambda count: on_progress(count * trajectories)
             logits, margins = np.split(hazards(graph, variables, source, every, devices, told), 2, axis=-1)
-            margins = margins * np.asarray(self.run.robot.limits, np.float32)
-        else:
-            samples: Samples = (np.repeat(every, trajectories), np.tile(np.arange(trajectories), len(maps)))
-            size = 64 * devices.mesh.size
-            logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
-            logits = logits.reshape(len(maps), trajectories, -1)
-        one = (lambda array: array[0]) if np.ndim(heights) == 2 else (lambda array: array)
-        return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
+            return logits, margins * np.asarray(self.run.robot.limits, np.float32)
+        samples: Samples = (np.repeat(every, trajectories), np.tile(np.arange(trajectories), len(maps)))
+        size = 64 * devices.mesh.size
+        logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
+        return logits.reshape(len(maps), trajectories, -1), None
 
 
 def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t 3"]:

@@ -11,16 +11,13 @@ from typing import Protocol
 import numpy as np
 
 from travjax.config import InputError, require, require_number
-from travjax.grid import HIGHEST, Grid
+from travjax.grid import HIGHEST, MARKERS, Grid
 
 COARSEST = 0.125
 """Metres: cells larger than this do not show a step or a rock."""
 
 LOWEST = -12_000.0
 """Metres: what is deeper is no height; HIGHEST is in grid.py."""
-
-MARKERS = (-9999, -99999, -32768, 9999)
-"""Usual marks of unknown ground that some files do not declare."""
 
 PART = 2**22
 """Cells of a raster that are in memory at once while it is read through: 32 MiB."""
@@ -29,7 +26,7 @@ SAMPLE = 2**24
 """Known heights of which the median is taken; of larger rasters every second, third ... value counts."""
 
 
-class Heights(Protocol):
+class HeightSource(Protocol):
     """Metres [rows, cols], NaN unknown, of which parts are read as they are asked for; an array is one."""
 
     @property
@@ -52,7 +49,7 @@ class Raster:
     height_offset: metres above which the heights are counted already, where it is a window that was written so
     """
 
-    heights: Heights
+    heights: HeightSource
     cell_size: float
     origin: tuple[float, float] = (0.0, 0.0)
     crs: str | None = None
@@ -61,7 +58,7 @@ class Raster:
 
 
 class InMetres:
-    """Values of a file as heights, turned into metres part by part; see Heights.
+    """Values of a file as heights, turned into metres part by part; see HeightSource.
 
     values:   [rows, cols] numbers of any type, in memory or mapped from a file
     scale:    metres a unit
@@ -125,7 +122,7 @@ def is_real(dtype: np.dtype) -> bool:
     return dtype.kind in "iuf"
 
 
-def parts(heights: Heights, beyond: int = 0) -> Iterator[tuple[slice, slice, np.ndarray]]:
+def parts(heights: HeightSource, beyond: int = 0) -> Iterator[tuple[slice, slice, np.ndarray]]:
     """Reads heights through from south to north, some rows at a time.
 
     Yields the rows, where they stand in the part that was read, and that part [rows, cols] with up to `beyond` rows
@@ -154,7 +151,7 @@ class Survey:
     median: float
 
 
-def survey(heights: Heights) -> Survey:
+def survey(heights: HeightSource) -> Survey:
     """Reads a raster through; raises InputError when a height cannot be one, or is an undeclared mark of none."""
     every = max(int(np.prod(heights.shape)) // SAMPLE, 1)
     known, lowest, highest, sampled = 0, np.inf, -np.inf, []

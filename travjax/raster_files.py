@@ -18,7 +18,7 @@ from travjax.coordinates import name_of, parsed, require_height_unit_named, requ
 from travjax.dem_options import DemOptions
 from travjax.formats import OTHERS
 from travjax.memory import require_memory
-from travjax.raster import Heights, InMetres, Raster, agreed_cell_size, is_real, marks_nothing
+from travjax.raster import HeightSource, InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 
 PICTURES = ("BMP", "GIF", "BIGGIF", "JP2OpenJPEG", "JPEG", "PNG", "PNM", "SGI", "TGA", "WEBP")
 """Drivers of pictures, which hold no metres; most are read from the first row on, so they are read at once."""
@@ -69,7 +69,7 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
         in_metres = scale, file.offsets[band - 1]
         if np.prod(file.shape) <= WHOLE or file.driver in PICTURES:
             require_memory(3 * int(np.prod(file.shape)) * dtype.itemsize, f"{file.width} x {file.height} pixels")
-            heights: Heights = _in_metres(file.read(band, masked=True), in_metres, options.nodata, southern)
+            heights: HeightSource = _in_metres(file.read(band, masked=True), in_metres, options.nodata, southern)
         else:
             heights = _FromFile(file, band, in_metres, options.nodata, southern)
     return Raster(heights, cell_size, origin, name_of(crs), marks_nothing(options.nodata, dtype))
@@ -176,7 +176,7 @@ def _require_own_data(path: Path) -> None:
 
 
 class _FromFile:
-    """Heights of a band that are read from the file as they are asked for; see raster.Heights."""
+    """Heights of a band that are read from the file as they are asked for; see HeightSource."""
 
     def __init__(self, file: Any, band: int, in_metres: tuple[float, float], nodata: float | None, southern: bool):
         self._file, self._band, self._in_metres = file, band, in_metres

@@ -16,9 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from travjax.arrays import integers, numbers
 from travjax.batching import in_batches
 from travjax.config import InputError, require, require_number
-from travjax.grid import Grid
+from travjax.flags import key_of, usual_flags
+from travjax.grid import Grid, require_grid
 from travjax.noise import SEEDS, noise_on_axes, permutation_table
 
 
@@ -135,6 +137,7 @@ _LIMITS = np.array(
 """[style, half, field, (low, high)]."""
 
 
+@usual_flags()
 def generate_terrain(
     style: str | Sequence[str], seeds, *, grid: Grid = Grid(), world: float | None = None
 ) -> Float[Array, "n rows cols"]:
@@ -149,29 +152,29 @@ def generate_terrain(
     return elevation(*sample_params(style, seeds), grid=grid, world=world)
 
 
+@usual_flags()
 def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, " n"]]:
     """The parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and errors."""
-    numbers = np.atleast_1d(np.asarray(seeds))
-    require(numbers.ndim == 1 and len(numbers) > 0, "seeds", seeds, "one or more integers")
-    whole = np.issubdtype(numbers.dtype, np.integer) and numbers.min() >= 0 and numbers.max() < 2**32
-    require(bool(whole), "seeds", seeds, "integers from 0 to 4294967295")
-    styles = [style] * len(numbers) if isinstance(style, str) else list(style)
+    allowed = f"one or more integers from 0 to {2**32 - 1}"
+    numbered = np.atleast_1d(integers("seeds", seeds, allowed, 0, 2**32 - 1))
+    require(numbered.ndim == 1, "seeds", seeds, allowed)
+    styles = [style] * len(numbered) if isinstance(style, str) else list(style)
     for name in set(styles):
         require(name in STYLES, "style", name, f"one of {', '.join(STYLES)}")
     require(
-        len(styles) == len(numbers), "style", f"{len(styles)} styles for {len(numbers)} seeds", "one, or one a seed"
+        len(styles) == len(numbered), "style", f"{len(styles)} styles for {len(numbered)} seeds", "one, or one a seed"
     )
     index = np.array([STYLES.index(name) for name in styles], np.uint32)
-    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbers.astype(np.uint32)))
+    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbered.astype(np.uint32)))
     return TerrainParams(*values.T), noise_seeds
 
 
 @jax.jit
 def _sample(style, seed):
     def sample_one(style, seed):
-        key = jax.random.fold_in(jax.random.key(seed, impl="threefry2x32"), style)
+        key = jax.random.fold_in(key_of(seed), style)
         for_half, for_values, for_noise = jax.random.split(key, 3)
-        half = jax.random.bernoulli(for_half).astype(jnp.int32)
+        half = jax.random.bernoulli(for_half, jnp.float32(0.5)).astype(jnp.int32)
         low, high = jnp.asarray(_LIMITS)[style, half].T
         values = low + (high - low) * jax.random.uniform(for_values, (len(FIELDS),), jnp.float32)
         return values, jax.random.randint(for_noise, (), 0, SEEDS, jnp.int32)
@@ -185,6 +188,7 @@ def require_world(world: float | None) -> None:
         require_number("world", world, math.nextafter(1, 0), 1000, "a map size in metres from 1 to 1000")
 
 
+@usual_flags()
 def elevation(
     params: TerrainParams, noise_seed, *, grid: Grid = Grid(), world: float | None = None
 ) -> Float[Array, "*n rows cols"]:
@@ -195,11 +199,10 @@ def elevation(
                 and different size are the same where they overlap
     Raises InputError when the noise seed, a parameter that shapes the noise, or the world lies outside what is allowed.
     """
+    require_grid(grid)
     require_world(world)
-    seeds = np.asarray(noise_seed)
-    inside = np.issubdtype(seeds.dtype, np.integer) and seeds.size and seeds.min() >= 0 and seeds.max() < SEEDS
-    require(bool(inside), "noise_seed", noise_seed, f"an integer from 0 to {SEEDS - 1}")
-    values = [np.asarray(getattr(params, field), np.float32) for field in FIELDS]
+    seeds = integers("noise_seed", noise_seed, f"an integer from 0 to {SEEDS - 1}", 0, SEEDS - 1)
+    values = [numbers(field, getattr(params, field)).astype(np.float32) for field in FIELDS]
     for field, value in zip(FIELDS, values, strict=True):
         if not np.isfinite(value).all():
             raise InputError(f"{field} = {getattr(params, field)}: must be finite")

@@ -9,7 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,10 +25,11 @@ from travjax.config import InputError, one_line, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import VARIABLES, take_apart
 from travjax.files import held
+from travjax.flags import usual_flags
 from travjax.inputs import ImageSource
 from travjax.map_data import MapSource
 from travjax.parallel import Devices
-from travjax.prediction import feature_logits, features_of, logits_of, probabilities
+from travjax.prediction import NoNumbers, feature_logits, features_of, logits_of, probabilities
 from travjax.runlog import RunLog
 from travjax.sampling import Samples
 from travjax.trained import TRAINED, Network, Run, checked_meta
@@ -108,12 +109,14 @@ class Trainer:
         samples = {"training": self.data.samples(1, 0)} | self.scored
         return {name: self._over(features_of, part, f"{name} features") for name, part in samples.items()}
 
+    @usual_flags()
     def start(self, estimator: Network) -> None:
         """Begins with an estimator, whose trunk phase 1 leaves as it is."""
         variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
         self.state: State = self.devices.replicate(variables)
         self._begin(1 if self.config.head_epochs else 2)
 
+    @usual_flags()
     def resume(self) -> None:
         """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
 
@@ -130,6 +133,7 @@ class Trainer:
         here = self.position
         self._say(f"goes on from step {here.total}: phase {here.phase}, epoch {here.epoch + 1}, batch {here.step + 1}")
 
+    @usual_flags()
     def train(self) -> None:
         """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
 
@@ -284,11 +288,12 @@ class Trainer:
         if self.position.phase == 1:
             features = self.devices.replicate(self.features[name])
             logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
+            if np.isfinite(logits).all():
+                return logits
         else:
-            logits = self._over(logits_of, self.scored[name], name)
-        if not np.isfinite(logits).all():
-            raise self._diverged(f"a {name} logit that is no number", self.position.step)
-        return logits
+            with suppress(NoNumbers):
+                return self._over(logits_of, self.scored[name], name)
+        raise self._diverged(f"a {name} logit that is no number", self.position.step)
 
     def summary(self) -> str:
         """One line: what is trained on what."""

@@ -20,6 +20,7 @@ from travjax.config import InputError, one_line, parts_from_json, read_json, req
 from travjax.estimator import VARIABLES, Estimator, put_together, take_apart
 from travjax.field import HazardField
 from travjax.files import save_text, user_path
+from travjax.flags import usual_flags
 from travjax.grid import Grid
 from travjax.imagenet import Weights
 from travjax.inputs import ImageSource
@@ -87,6 +88,7 @@ class Run:
             if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
 
+    @usual_flags()
     def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
         """An estimator with random parameters, or a ResNet with a trunk of `weights`.
 
@@ -106,10 +108,12 @@ class Run:
             return MapSource.of(heights, self.robot, self.actions, self.grid, scale)
         return ImageSource.of(heights, self.robot, self.actions, self.grid, scale, on_progress)
 
+    @usual_flags()
     def graph(self) -> nnx.GraphDef:
         """What is fixed of the estimator."""
         return take_apart(nnx.eval_shape(self.create))[0]
 
+    @usual_flags()
     def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
         """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
 
@@ -152,6 +156,7 @@ def checked_meta(meta: dict, folder: str | Path) -> dict:
     return meta
 
 
+@usual_flags()
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 

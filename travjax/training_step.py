@@ -15,6 +15,7 @@ from flax import nnx
 
 from travjax.estimator import Estimator, put_together
 from travjax.field import HazardField
+from travjax.flags import key_of, usual_flags
 from travjax.models import FIELD
 from travjax.trained import TRAINED
 
@@ -53,6 +54,7 @@ SMALL_ERROR = 0.3
 """Limits; up to there an error of a margin counts by its square."""
 
 
+@usual_flags()
 @partial(jax.jit, static_argnames=("graph", "phase", "optimizer", "penalty"), donate_argnames="state")
 def update(state: State, inputs, targets, weight, seed, step, *, graph, phase: int | str, optimizer, penalty: float):
     """One step of a phase: the new state, and the mean of the loss over the batch.
@@ -60,7 +62,7 @@ def update(state: State, inputs, targets, weight, seed, step, *, graph, phase: i
     inputs, targets: what LOSS[phase] takes; weight: [b], 0 for a sample that only fills the batch up
     penalty: times the sum of squares of the heads' kernels
     """
-    key = jax.random.fold_in(jax.random.key(seed), step)
+    key = jax.random.fold_in(key_of(seed), step)
 
     def loss(parameters):
         estimator = put_together(graph, state | parameters)

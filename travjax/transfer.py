@@ -18,6 +18,7 @@ from travjax.config import InputError, require
 from travjax.dataset import Dataset, require_same
 from travjax.estimator import Estimator, Heads, create
 from travjax.files import output_folder, save_npz
+from travjax.flags import key_of
 from travjax.imagenet import load_weights
 from travjax.models import FIELD
 from travjax.parallel import Devices
@@ -186,7 +187,7 @@ class Transfer:
         weights = load_weights(file, preset.trunk) if file else None
         trunk_seed = self.config.seeds[0] if self.config.frozen else seed
         made = create(preset.trunk, preset.heads, trunk_seed, weights)
-        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(seed + 1)))
+        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(key_of(seed + 1))))
 
     def _share_features(self, trainer: Trainer, arm: str) -> None:
         """The features of a frozen trunk, kept in a file for its other seeds and for a run that goes on."""

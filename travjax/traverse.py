@@ -19,12 +19,13 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from travjax.actions import ActionSpace
 from travjax.batching import in_batches
-from travjax.config import InputError
+from travjax.config import require
+from travjax.flags import usual_flags
 from travjax.footprint import RUN, Layout, View, chassis_places, node_table
 from travjax.grid import HIGHEST, Grid
+from travjax.heights import Heights, as_maps
 from travjax.robot import Robot
-
-Heights = Float[Array, "*n rows cols"] | Float[np.ndarray, "*n rows cols"]
+from travjax.rounding import rounded
 
 EVENTS = ("step", "obstacle", "tilt")
 
@@ -78,6 +79,13 @@ def chosen_robot(robot: Robot | str | None) -> Robot:
     return default_robot() if robot is None else Robot.load(robot)
 
 
+def chosen_actions(actions: ActionSpace | None) -> ActionSpace:
+    """The action space that an argument gives: the paper's for None. Raises InputError for anything else."""
+    require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
+    return ActionSpace() if actions is None else actions
+
+
+@usual_flags()
 def simulate(
     heights: Heights,
     robot: Robot | str | None = None,
@@ -87,16 +95,18 @@ def simulate(
 ) -> Margins:
     """Margins of every trajectory on every map.
 
-    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown; laid out as in grid.py. float64 NumPy heights are
-             taken relative to the map's centre before they become float32, so a site at 2000 m loses nothing
+    heights: [n, rows, cols] or [rows, cols] metres, NaN or masked where unknown; laid out as in grid.py. Any array of
+             numbers, or lists of them; float64 heights are taken relative to the map's centre before they become
+             float32, so a site at 2000 m loses nothing
     robot:   a Robot, or the name or file of one; the Seekur Jr unless given
     actions: the paper's action space unless given
     Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
-    Raises InputError when heights have another shape than the grid or are not numbers, when NumPy heights are infinite
-    or beyond 30 km, and when a trajectory leaves the map or turns inside the robot.
+    Raises InputError when heights have another shape than the grid or are not numbers, when they are infinite, beyond
+    30 km or a usual mark of unknown ground such as -9999 (but for a jax array, which is not looked at: what is infinite
+    or beyond is unknown there), and when a trajectory leaves the map or turns inside the robot.
     """
-    robot, actions = chosen_robot(robot), actions or ActionSpace()
-    maps = as_maps(heights, grid)
+    maps, alone = as_maps(heights, grid)
+    robot, actions = chosen_robot(robot), chosen_actions(actions)
     layout = node_table(robot, actions, grid).layout
 
     def simulate_batch(batch: jax.Array) -> Margins:
@@ -104,14 +114,16 @@ def simulate(
         return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout)
 
     margins = in_batches(simulate_batch, maps)
-    return jax.tree.map(lambda margin: margin[0], margins) if np.ndim(heights) == 2 else margins
+    return jax.tree.map(lambda margin: margin[0], margins) if alone else margins
 
 
+@usual_flags()
 def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
     """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
     return margins.events() > jnp.asarray(chosen_robot(robot).limits, jnp.float32)
 
 
+@usual_flags()
 def label(
     heights: Heights,
     robot: Robot | str | None = None,
@@ -126,48 +138,19 @@ def label(
     return failures(simulate(heights, robot, actions, grid=grid), robot)
 
 
+@usual_flags()
 @jax.jit
 def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
     """Labels in one byte a trajectory: bits 0 to 2 the failures in the order of EVENTS, bit 3 unknown."""
     bits = jnp.concatenate([failed, ~known[..., None]], axis=-1)
-    return (bits << jnp.arange(4)).sum(axis=-1).astype(jnp.uint8)
+    return (bits << jnp.arange(4, dtype=jnp.int32)).sum(axis=-1).astype(jnp.uint8)
 
 
+@usual_flags()
 def unpacked(labels) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
     """The (failed, known) that `packed` was given, from its labels: [n, t] uint8."""
     bits = (jnp.asarray(labels)[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
     return bits[..., :3].astype(bool), bits[..., 3] == 0
-
-
-def as_maps(heights: Heights, grid: Grid) -> Float[Array, "n rows cols"]:
-    """Checked float32 maps with a leading axis; float64 NumPy heights relative to each map's centre.
-
-    Masked nodes are unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or
-    absurd ones are unknown.
-    """
-    if np.ma.isMaskedArray(heights):
-        heights = np.ma.filled(heights.astype(np.float64), np.nan)
-    if not isinstance(heights, jax.Array):
-        heights = np.asarray(heights)
-    if not jnp.issubdtype(heights.dtype, jnp.number) or np.iscomplexobj(heights):
-        raise InputError(f"heights: dtype {heights.dtype}: must be numbers (metres)")
-    if heights.ndim not in (2, 3) or heights.shape[-2:] != grid.shape:
-        allowed = f"[{grid.nodes}, {grid.nodes}] or [n, {grid.nodes}, {grid.nodes}]"
-        raise InputError(
-            f"heights: shape {list(heights.shape)}: must be {allowed}, a {grid.size:g} m map at {grid.spacing:g} m"
-        )
-    if heights.size == 0:
-        raise InputError("heights: zero maps: must be at least one")
-    maps = heights.reshape(-1, *grid.shape)
-    if isinstance(maps, np.ndarray):
-        absurd = np.abs(maps) > HIGHEST
-        if absurd.any():
-            allowed = f"metres between {-HIGHEST:g} and {HIGHEST:g}, or NaN where unknown"
-            raise InputError(f"heights = {maps[absurd][0]:g}: must be {allowed}")
-        if maps.dtype != np.float32:
-            maps = maps.astype(np.float64)
-            maps = maps - np.nan_to_num(maps[:, grid.cells // 2, grid.cells // 2, None, None])
-    return jnp.asarray(maps, jnp.float32)
 
 
 @partial(
@@ -275,16 +258,21 @@ class _Planes:
 
 
 def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
-    """The least-squares planes through the four contacts."""
+    """The least-squares planes through the four contacts.
+
+    Each sum is joined with one product at most, however the loop is compiled: a map has the same bits in any batch.
+    """
     front_left, front_right, rear_left, rear_right = contact
     pitch = ((front_left + front_right) - (rear_left + rear_right)) * (0.5 / wheelbase)
     roll = ((front_right + rear_right) - (front_left + rear_left)) * (0.5 / track)
     cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
-    east = (roll * cos - pitch * sin) * spacing
-    north = (roll * sin + pitch * cos) * spacing
+    east = (roll * cos - rounded(pitch * sin)) * spacing
+    north = (roll * sin + rounded(pitch * cos)) * spacing
+    slope = pitch * pitch + rounded(roll * roll)
+    east, north, slope = jax.lax.optimization_barrier((east, north, slope))
     middle = (front_left + front_right + rear_left + rear_right) / 4
-    level = middle - east * chunk.offset[:, :1] - north * chunk.offset[:, 1:]
-    return _Planes(*jax.lax.optimization_barrier((level, east, north, pitch**2 + roll**2)))
+    level = middle - rounded(east * chunk.offset[:, :1]) - north * chunk.offset[:, 1:]
+    return _Planes(jax.lax.optimization_barrier(level), east, north, slope)
 
 
 def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
