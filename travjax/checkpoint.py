@@ -264,7 +264,7 @@ def _require_same(path: Path, saved: dict[str, list], wanted: dict[str, list]) -
 
 
 def _require_room(folder: Path, size: int) -> None:
-    """Raises OSError where a checkpoint of so many bytes has no room: Orbax finds out late, and may hang for minutes."""
+    """Raises OSError where a checkpoint of so many bytes has no room: Orbax finds out late, and may hang then."""
     places = [folder / f"room-{number}" for number in range(ENTRIES)]
     for place in places:
         place.touch()
