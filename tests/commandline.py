@@ -28,9 +28,16 @@ class Run(NamedTuple):
             return dict(file)
 
 
+class Terminal(io.StringIO):
+    """Standard errors that somebody watches, so that bars are drawn."""
+
+    def isatty(self) -> bool:
+        return True
+
+
 def run_words(*words) -> tuple[int, str, str]:
     """`travjax words...` in this process: exit code, standard output and errors."""
-    out, err = io.StringIO(), io.StringIO()
+    out, err = io.StringIO(), Terminal()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         return cli.main([*map(str, words)]), out.getvalue(), err.getvalue()
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from commandline import Terminal
 from PIL import Image
 
 from travjax import bench, cli
@@ -188,7 +189,7 @@ def test_the_command_prints_the_table_and_the_speed_up_and_writes_it_and_a_figur
     monkeypatch.setattr(bench, "start_row", lambda: bench._row("start", 1, 2.0, 0, None, 3))
     folder = tmp_path / "out"
     words = ["bench", "--repeats", "1", "--stream", "2", "--size", "3.75", "--spacing", "0.125"]
-    out, err = io.StringIO(), io.StringIO()
+    out, err = io.StringIO(), Terminal()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         assert cli.main([*words, "--actions", str(tmp_path / "few.toml"), "--out", str(folder)]) == 0
     rows = parsed(folder / "bench.tsv")

@@ -1,5 +1,6 @@
 """Checkpoints come back bit for bit, survive kills, damage and full disks, and say in one line what is wrong."""
 
+import asyncio
 import errno
 import json
 import os
@@ -369,6 +370,51 @@ def test_a_full_disk_leaves_the_earlier_checkpoints(tmp_path, monkeypatch, stage
     require_equal(checkpoints.restore(state_of(0))[0], state_of(1))
     checkpoints.save(2, state_of(2), meta_of(2))
     assert load_meta(tmp_path) == meta_of(2)
+
+
+def test_writes_that_are_under_way_when_one_fails_end_before_what_they_wrote_is_removed():
+    # Orbax closes its event loop at once; the threads of the others then print tracebacks, and make folders again.
+    ended = []
+
+    async def write():
+        await asyncio.sleep(0.05)
+        await asyncio.to_thread(ended.append, "thread")
+        ended.append("task")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    async def save():
+        tasks.append(asyncio.create_task(write()))
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    tasks, before = [], asyncio.get_event_loop_policy()
+    with checkpoint._patient_loops():
+        loop = asyncio.new_event_loop()
+        with pytest.raises(OSError):
+            loop.run_until_complete(save())
+        loop.close()
+        loop.close()
+    assert ended == ["thread", "task"] and isinstance(tasks[0].exception(), OSError)
+    assert asyncio.get_event_loop_policy() is before
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_disk_without_room_is_found_before_arrays_are_written(tmp_path, monkeypatch, code):
+    checkpoints = saved(tmp_path, 1)
+    asked = []
+
+    def full(number, start, size):
+        asked.append(size)
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr(checkpoint, "_patient_loops", None)  # not reached
+    with pytest.raises(InputError) as raised:
+        checkpoints.save(2, state_of(2), meta_of(2))
+    assert one_line(raised) == (
+        f"{tmp_path}: checkpoint cannot be written: {os.strerror(code)}; the earlier ones are kept"
+    )
+    assert asked[0] > sum(leaf.nbytes for leaf in jax.tree.leaves(state_of(2)))
+    assert listing(tmp_path) == ["000001-step-1"]
 
 
 def test_arrays_that_the_system_will_not_take_leave_the_earlier_checkpoints(tmp_path):

@@ -399,6 +399,27 @@ def test_a_folder_of_something_else_is_left_alone_before_anything_is_made(tmp_pa
     assert files(tmp_path) == {tmp_path / "thesis.txt"}
 
 
+@pytest.mark.parametrize("text", ["mine\n", ""])
+def test_a_file_of_the_user_s_is_not_replaced_by_the_statistics(tmp_path, monkeypatch, text):
+    monkeypatch.setattr(command, "generate", None)  # not reached
+    notes = tmp_path / "set_statistics.txt"
+    notes.write_text(text)
+    done = run(tmp_path / "set", *WORDS)
+    way = f"{notes} is in the way, and no table of travjax; allowed: another name, or none there"
+    assert (done.code, done.err.splitlines()[-1]) == (2, f"travjax: --out {tmp_path / 'set'}: {way}")
+    assert files(tmp_path) == {notes} and notes.read_text() == text
+
+
+@pytest.mark.parametrize("option", ["--out", "--tfds"])
+def test_a_link_to_itself_is_one_line(tmp_path, few, option):
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    code, _, err = run_words(*WORDS, "--actions", few, "--robot", "husky_a200", "--out", tmp_path / "set", option, loop)
+    assert code == 2
+    assert err == f"travjax: {loop}: a symbolic link that leads to itself; allowed: a folder, or a new one\n"
+    assert files(tmp_path) == {loop}
+
+
 def test_a_foreign_file_beside_the_arrays_is_kept(copied, few):
     (copied / "notes.txt").write_text("mine")
     before = load(copied)

@@ -134,7 +134,28 @@ def test_a_resnet_is_exported_too(trained, tmp_path):
     assert row(said, "estimator").startswith("resnet50, ") and "Beside the simulator" not in said
 
 
+def test_a_card_and_a_file_of_ours_are_replaced(field, tmp_path):
+    to = tmp_path / "it.safetensors"
+    for which in ("latest", "best"):
+        exported(field, to, "--checkpoint", which)
+    best = load_meta(field / "checkpoints", "best")["position"]["total"]
+    assert f", {best:,} steps" in row((tmp_path / "it.md").read_text(), "trained on")
+
+
 # ---- Bad input
+
+
+@pytest.mark.parametrize(
+    ("name", "what"), [("notes.md", "model card"), ("notes.safetensors", "estimator"), ("notes.md/mine", "model card")]
+)
+def test_no_file_of_the_user_s_is_replaced(field, tmp_path, name, what):
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("# notes.safetensors\n\nmine\n")
+    before, to = files(tmp_path), tmp_path / "notes.safetensors"
+    way = f"{tmp_path / name.split('/')[0]} is in the way, and no {what} of travjax"
+    assert refusal(field, "--to", to) == f"--to {to}: {way}; allowed: another name, or none there"
+    assert files(tmp_path) == before and mine.read_text() == "# notes.safetensors\n\nmine\n"
 
 
 def test_another_kind_of_file_is_one_line(field, tmp_path):

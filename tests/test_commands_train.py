@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -234,6 +235,29 @@ def test_two_processes_train_like_one_device_and_go_on_together(alone, tmp_path)
     one, two = saved_state(tmp_path / "run"), saved_state(alone[1])
     assert one.keys() == two.keys()
     train((*alone[0], "--out", tmp_path / "run", "--resume"))  # on one device
+
+
+def test_a_folder_in_use_is_refused_at_once_and_an_interruption_says_how_it_goes_on(trained, tmp_path, words):
+    words = (*words, "--out", tmp_path / "run")
+    first = program(words)
+    try:
+        while not any((tmp_path / "run/checkpoints").glob("0*")):
+            assert first.poll() is None
+            time.sleep(0.01)
+        before = rows_of(tmp_path / "run")
+        assert re.fullmatch(
+            f"--out {tmp_path}/run: in use by process {first.pid} on .+; allowed: a folder that no other run uses",
+            refusal((*words, "--resume")),
+        )
+        assert rows_of(tmp_path / "run")[: len(before)] == before
+        first.send_signal(signal.SIGINT)
+        out, err = first.communicate(timeout=100)
+    finally:
+        first.kill()
+    assert first.returncode == 130, err
+    assert err == "travjax: interrupted; with --resume the same command goes on from the latest checkpoint\n"
+    train((*words, "--resume"))
+    assert rows_of(tmp_path / "run") == rows_of(trained)
 
 
 # ---- Bad input; each is found before training

@@ -3,13 +3,16 @@
 import os
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import jax
 import pytest
 from conftest import cache_in
 
 from travjax import entry
-from travjax.config import InputError
+from travjax.config import InputError, naming
+from travjax.signals import Terminated
 
 # ---- How a program ends
 
@@ -24,6 +27,11 @@ def ends(error: BaseException, capsys) -> tuple[int, str]:
     said = capsys.readouterr()
     assert said.out == ""
     return code, said.err
+
+
+def noted(error: BaseException, note: str) -> BaseException:
+    error.add_note(note)
+    return error
 
 
 def test_work_that_ends_well_says_nothing_and_gives_0(capsys):
@@ -50,7 +58,15 @@ def test_work_that_ends_well_says_nothing_and_gives_0(capsys):
             2,
             "out of memory: RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.; try fewer maps or",
         ),
+        (
+            noted(MemoryError("Unable to allocate 9 GiB"), "site.tif"),
+            2,
+            "site.tif: out of memory: Unable to allocate 9",
+        ),
+        (MemoryError(), 2, "out of memory; try fewer maps or"),
         (KeyboardInterrupt(), 130, "interrupted"),
+        (Terminated(), 143, "terminated"),
+        (noted(KeyboardInterrupt(), "it goes on"), 130, "interrupted; it goes on"),
     ],
 )
 def test_what_goes_wrong_is_one_line(error, code, line, capsys):
@@ -80,6 +96,52 @@ def test_a_reader_that_has_gone_ends_the_program_quietly():
     assert process.stderr.read() == b""
     assert process.wait(60) == 1
     process.stderr.close()
+
+
+def test_out_of_memory_names_what_was_read_first(capsys):
+    def work():
+        with naming("label"), naming("site.tif"):
+            raise MemoryError("Unable to allocate 9 GiB")
+
+    assert entry.guarded(work) == 2
+    assert capsys.readouterr().err.startswith("travjax: site.tif: out of memory: Unable to allocate 9 GiB; ")
+
+
+# ---- Streams
+
+SPEAKS = r"""
+import sys
+from travjax import entry
+def work():
+    print("\udcff é")
+    print("\udcff é", file=sys.stderr)
+    raise entry.InputError("bad \udcff")
+raise SystemExit(entry.guarded(work))
+"""
+
+
+def speaks(redirections: str = "", **environment: str) -> tuple[int, bytes, bytes]:
+    words = ["sh", "-c", f'exec "$@" {redirections}', "sh", sys.executable, "-c", SPEAKS]
+    done = subprocess.run(words, capture_output=True, env=os.environ | environment)
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "utf-8", "latin-1"])
+def test_no_letter_of_a_file_s_name_is_too_much_for_a_stream(encoding):
+    line = b"\\udcff " + "é".encode(encoding, "backslashreplace") + b"\n"
+    assert speaks(PYTHONIOENCODING=encoding) == (2, line, line + b"travjax: bad \\udcff\n")
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&-", ">&- 2>&-", "<&- >&- 2>&-"])
+def test_closed_streams_are_done_without(closed):
+    code, out, err = speaks(closed, PYTHONIOENCODING="utf-8")
+    assert code == 2
+    assert (bool(out), bool(err)) == (closed == "2>&-", closed == ">&-")
+
+
+def test_a_full_disk_behind_standard_output_is_one_line():
+    code, _, err = speaks(">/dev/full", PYTHONIOENCODING="utf-8")
+    assert code == 2 and err.endswith(b"\n") and b"Traceback" not in err and b"Exception ignored" not in err
 
 
 def test_a_parser_says_what_is_wrong_in_one_line():
@@ -119,10 +181,26 @@ def test_the_cache_can_be_moved(settings, tmp_path, monkeypatch):
     assert not (tmp_path / "home").exists()
 
 
-def test_without_a_place_for_it_there_is_no_cache(settings, tmp_path):
-    (tmp_path / "home").write_text("a file")
+@pytest.mark.parametrize("place", ["a file", "nowhere"])
+def test_without_a_place_for_it_there_is_no_cache(settings, tmp_path, monkeypatch, place):
+    monkeypatch.delenv("MPLCONFIGDIR", raising=False)
+    monkeypatch.setattr("atexit.register", lambda *works, **how: None)
+    if place == "a file":
+        (tmp_path / "home").write_text("a file")
+    else:
+        monkeypatch.setenv("HOME", "")
+        monkeypatch.setenv("XDG_CACHE_HOME", "relative")
     entry.use_compilation_cache()
     assert settings.jax_compilation_cache_dir is None
+    assert os.access(os.environ["MPLCONFIGDIR"], os.W_OK)  # matplotlib would end in a traceback
+    os.rmdir(os.environ["MPLCONFIGDIR"])
+    monkeypatch.delenv("MPLCONFIGDIR")
+
+
+def test_an_editable_install_is_a_path():
+    # Else it is a finder, which comes after a folder called travjax where Python starts.
+    pyproject = tomllib.loads((Path(entry.__file__).parents[1] / "pyproject.toml").read_text())
+    assert pyproject["tool"]["setuptools"]["package-dir"] == {"": "."}
 
 
 # ---- XLA's log

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commandline import FEW, FEW_TOML
+from commandline import FEW, FEW_TOML, Terminal
 from conftest import HUSKY, SEEKUR_JR
 from PIL import Image
 
@@ -30,7 +30,7 @@ OURS = ["sequential simulator", "batched simulator, 1 map", "batched simulator, 
 
 def run(folder: Path, *words) -> tuple[int, str, str]:
     """The experiment in this process: exit code, standard output and errors."""
-    out, err = io.StringIO(), io.StringIO()
+    out, err = io.StringIO(), Terminal()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         return timing.main([*map(str, words), "--out", str(folder)]), out.getvalue(), err.getvalue()
 

@@ -1,12 +1,18 @@
 """Files are written whole or not at all, and output folders are checked."""
 
+import signal
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from travjax import files
 from travjax.config import InputError
-from travjax.files import find_data, output_folder, save_npz, written_whole
+from travjax.files import find_data, folder_written_whole, held, output_folder, save_npz, written_whole
 
 
 def listing(folder) -> set[str]:
@@ -22,11 +28,13 @@ def test_a_file_appears_when_the_block_ends(tmp_path):
     assert listing(tmp_path) == {"a.txt"}
 
 
-def test_the_temporary_file_lies_beside_the_final_one(tmp_path):
+def test_the_temporary_file_lies_in_a_hidden_folder_beside_the_final_one(tmp_path):
     # Only within one file system is it a rename, which happens at once.
     with written_whole(tmp_path / "a.txt") as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.name != "a.txt"
+        assert temporary.name == "a.txt"
+        assert temporary.parent.parent == tmp_path and temporary.parent.name.startswith(".travjax-unfinished-")
+        temporary.touch()
+    with written_whole(tmp_path / ("n" * 255)) as temporary:
         temporary.touch()
 
 
@@ -164,3 +172,247 @@ def test_missing_data_are_one_line_that_says_what_is_allowed(tmp_path, monkeypat
         find_data("a.tif", "map of the moon", "--map FILE")
     message = "map of the moon a.tif: no such file here, and TRAVJAX_DATA is not set; allowed: --map FILE"
     assert str(raised.value) == message
+
+
+# ---- What dead processes leave
+
+
+def killed(folder: Path, script: str) -> None:
+    """Runs a script in the folder, in a process that ends by SIGKILL."""
+    start = "import os, signal\nfrom pathlib import Path\nfrom travjax import files\n"
+    end = "\nos.kill(os.getpid(), signal.SIGKILL)\n"
+    done = subprocess.run([sys.executable, "-c", start + script.replace("KILL", end.strip())], cwd=folder)
+    assert done.returncode == -signal.SIGKILL
+
+
+FILE = "with files.written_whole(Path('a.txt')) as temporary:\n    temporary.write_text('half')\n    KILL"
+FOLDER = """
+with files.folder_written_whole(Path('set'), lambda folder: True) as temporary:
+    (temporary / 'half').touch()
+    KILL
+"""
+
+
+@pytest.mark.parametrize("script", [FILE, FOLDER])
+def test_the_next_process_removes_what_a_dead_one_was_writing(tmp_path, script):
+    killed(tmp_path, script)
+    assert len(listing(tmp_path)) == 1 and "a.txt" not in listing(tmp_path)
+    with written_whole(tmp_path / "b.txt") as temporary:
+        temporary.touch()
+    assert listing(tmp_path) == {"b.txt"}
+
+
+def test_an_output_folder_is_cleared_of_it_at_once(tmp_path):
+    killed(tmp_path, FILE)
+    output_folder(tmp_path)
+    assert listing(tmp_path) == set()
+
+
+def test_what_a_live_process_is_writing_is_left_alone(tmp_path):
+    # Also by a process of the same number, as all containers have.
+    with written_whole(tmp_path / "a.txt") as mine:
+        mine.write_text("mine")
+        with written_whole(tmp_path / "a.txt") as other:
+            other.write_text("other")
+        output_folder(tmp_path)
+        other_process = "from travjax.files import output_folder; output_folder('.')"
+        subprocess.run([sys.executable, "-c", other_process], cwd=tmp_path, check=True)
+    assert (tmp_path / "a.txt").read_text() == "mine"
+    assert listing(tmp_path) == {"a.txt"}
+
+
+def test_a_folder_of_the_user_is_no_remains(tmp_path):
+    for name in (".travjax-unfinished", ".travjax-unfinished-of-mine", ".12-labels.npz"):
+        (tmp_path / name).mkdir()
+    before = listing(tmp_path)
+    output_folder(tmp_path)
+    assert listing(tmp_path) == before
+
+
+# ---- Folders that are written whole
+
+
+def folder_of(path: Path, text: str) -> Path:
+    with folder_written_whole(path, lambda folder: (folder / "it.txt").exists()) as temporary:
+        (temporary / "it.txt").write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_a_folder_replaces_an_older_one(tmp_path, monkeypatch, exchanges):
+    if not exchanges:
+        monkeypatch.setattr(files, "_exchanged", lambda one, other: False)
+    for text in ("old", "new"):
+        folder = folder_of(tmp_path / "set", text)
+        assert (folder / "it.txt").read_text() == text
+        assert listing(tmp_path) == {"set"}
+
+
+def test_the_system_exchanges_two_folders_at_once(tmp_path):
+    for name in ("one", "other"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / name).touch()
+    assert files._exchanged(tmp_path / "one", tmp_path / "other")
+    assert listing(tmp_path / "one") == {"other"} and listing(tmp_path / "other") == {"one"}
+    assert not files._exchanged(tmp_path / "one", tmp_path / "none")
+
+
+BETWEEN = """
+files._exchanged = lambda one, other: False
+rename = Path.rename
+def killed(self, place):
+    if self.name == 'set' and place == Path('set').resolve():
+        KILL
+    return rename(self, place)
+Path.rename = killed
+with files.folder_written_whole(Path('set'), lambda folder: True) as temporary:
+    (temporary / 'it.txt').write_text('new')
+"""
+
+
+@pytest.mark.parametrize("looks", [files.put_back, lambda folder: output_folder(folder.parent)])
+def test_a_folder_comes_back_that_a_dead_process_had_moved_aside(tmp_path, looks):
+    folder_of(tmp_path / "set", "old")
+    killed(tmp_path, BETWEEN)
+    assert "set" not in listing(tmp_path)
+    looks(tmp_path / "set")
+    assert (tmp_path / "set/it.txt").read_text() == "old"
+    assert listing(tmp_path) == {"set"}
+
+
+def test_a_folder_stays_where_its_place_was_when_the_other_cannot_take_it(tmp_path, monkeypatch):
+    folder_of(tmp_path / "set", "old")
+    monkeypatch.setattr(files, "_exchanged", lambda one, other: False)
+    rename = Path.rename
+
+    def refused(self, place):
+        if self.name == "set" and place == tmp_path / "set" and "replaced" not in str(self):
+            raise PermissionError(13, "Permission denied")
+        return rename(self, place)
+
+    monkeypatch.setattr(Path, "rename", refused)
+    with pytest.raises(InputError, match="set: cannot be written: Permission denied"):
+        folder_of(tmp_path / "set", "new")
+    assert (tmp_path / "set/it.txt").read_text() == "old"
+    assert listing(tmp_path) == {"set"}
+
+
+def test_a_folder_that_holds_something_else_is_kept(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set/mine").touch()
+    with pytest.raises(InputError, match="set: holds something else"):
+        folder_of(tmp_path / "set", "new")
+    assert listing(tmp_path) == {"set"} and listing(tmp_path / "set") == {"mine"}
+
+
+def test_a_link_to_itself_is_one_line(tmp_path):
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    with pytest.raises(InputError, match="loop: "):
+        folder_of(loop, "new")
+    with pytest.raises(InputError, match="loop: "), held(loop):
+        pass
+    assert listing(tmp_path) == {"loop"}
+
+
+# ---- Folders that one process uses
+
+
+HOLDS = """
+with files.held(Path('run')):
+    Path('holds').touch()
+    input()
+"""
+
+
+def test_a_folder_in_use_is_refused_until_its_process_is_dead(tmp_path):
+    start = "import os, signal\nfrom pathlib import Path\nfrom travjax import files\n"
+    other = subprocess.Popen([sys.executable, "-c", start + HOLDS], cwd=tmp_path, stdin=subprocess.PIPE)
+    try:
+        while not (tmp_path / "holds").exists():
+            assert other.poll() is None
+            time.sleep(0.01)
+        with pytest.raises(InputError) as raised, held(tmp_path / "run"):
+            pass
+        used = f"in use by process {other.pid} on {socket.gethostname()}"
+        assert str(raised.value) == f"--out {tmp_path}/run: {used}; allowed: a folder that no other run uses"
+    finally:
+        other.kill()
+        other.communicate()
+    assert listing(tmp_path / "run") == {files.LOCK}
+    with held(tmp_path / "run"):
+        (tmp_path / "run/made").touch()
+    assert listing(tmp_path / "run") == {"made"}
+
+
+def test_a_process_may_hold_a_folder_twice_and_an_empty_new_one_goes(tmp_path):
+    with held(tmp_path / "run"), held(tmp_path / "run"):
+        assert listing(tmp_path / "run") == {files.LOCK}
+    assert listing(tmp_path) == set()
+    (tmp_path / "run").mkdir()
+    with held(tmp_path / "run"):
+        pass
+    assert listing(tmp_path) == {"run"}
+
+
+# ---- What a user names
+
+
+def test_a_user_s_home_stands_for_its_sign(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("TRAVJAX_DATA", raising=False)
+    (tmp_path / "a.tif").touch()
+    assert files.user_path("~/a/b") == tmp_path / "a/b"
+    assert find_data("~/a.tif", "map") == tmp_path / "a.tif"
+    assert output_folder("~/out") == tmp_path / "out" and (tmp_path / "out").is_dir()
+    monkeypatch.setenv("TRAVJAX_DATA", "~")
+    assert find_data("a.tif", "map") == tmp_path / "a.tif"
+    assert files.user_path("~nobody-of-this-name/a") == Path("~nobody-of-this-name/a")
+
+
+@pytest.mark.parametrize(
+    ("home", "given", "expected"),
+    [
+        ("/home/me", None, "/home/me/.cache/travjax"),
+        ("/home/me", "", "/home/me/.cache/travjax"),
+        ("/home/me", "/cache", "/cache/travjax"),
+        ("/home/me", "relative", "/home/me/.cache/travjax"),
+        ("", None, None),
+        ("", "/cache", "/cache/travjax"),
+        ("relative", None, None),
+    ],
+)
+def test_the_cache_is_where_the_standard_says_or_nowhere(monkeypatch, home, given, expected):
+    monkeypatch.setenv("HOME", home)
+    monkeypatch.setenv("XDG_CACHE_HOME", given) if given is not None else monkeypatch.delenv("XDG_CACHE_HOME", False)
+    assert files.cache_folder() == (Path(expected) if expected else None)
+
+
+def test_a_user_who_is_unknown_has_no_cache(monkeypatch):
+    for name in ("HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def unknown(number):
+        raise KeyError(number)
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    assert files.cache_folder() is None
+
+
+def test_letters_that_utf_8_lacks_are_escaped_in_a_text(tmp_path):
+    path = files.save_text(tmp_path / "a.txt", "\udcff é\n")
+    assert path.read_bytes() == "\\udcff é\n".encode()
+
+
+def test_only_a_file_of_ours_is_replaced(tmp_path):
+    ours = lambda path: files.first_lines(path, 1) == ["ours"]
+    path = tmp_path / "notes.md"
+    files.require_replaceable(path, ours, "--to x", "card")
+    for there in ("mine\nours\n", ""):
+        path.write_text(there)
+        with pytest.raises(InputError) as raised:
+            files.require_replaceable(path, ours, "--to x", "card")
+        line = f"--to x: {path} is in the way, and no card of travjax; allowed: another name, or none there"
+        assert str(raised.value) == line
+    path.write_text("ours\nmore")
+    files.require_replaceable(path, ours, "--to x", "card")

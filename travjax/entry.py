@@ -75,6 +75,7 @@ def guarded(work: Callable[[], object]) -> int:
                 raise
             return _ended(2, _out_of_memory(error))
         except KeyboardInterrupt as error:
+            warnings.simplefilter("ignore")  # Python's, of coroutines that were cut off
             return _ended(*signals.ending(error))
     return 0
 
@@ -106,24 +107,23 @@ def use_compilation_cache() -> None:
     """Compiled code is kept between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
     import jax
 
-    cache = cache_folder()
+    cache, moved = cache_folder(), "JAX_COMPILATION_CACHE_DIR" in os.environ
+    if cache and not moved:
+        try:
+            jax.config.update("jax_compilation_cache_dir", str(output_folder(cache / "jax")))
+        except InputError:
+            cache = None
     if cache is None:
         _give_matplotlib_a_folder()
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        try:
-            place = cache and output_folder(cache / "jax")
-        except InputError:
+        if not moved:
             return
-        if not place:
-            return
-        jax.config.update("jax_compilation_cache_dir", str(place))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")  # a full disk
 
 
 def _give_matplotlib_a_folder() -> None:
-    """It ends in a traceback where the user has no home."""
+    """Without a home it ends in a traceback, and it says much of one that cannot be written to."""
     if "MPLCONFIGDIR" not in os.environ:
         os.environ["MPLCONFIGDIR"] = tempfile.mkdtemp(prefix="travjax-matplotlib-")
         atexit.register(shutil.rmtree, os.environ["MPLCONFIGDIR"], ignore_errors=True)

@@ -95,7 +95,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Makes and saves a data set or checks one, prints what it holds, and exports it if that is asked for."""
     folder = arguments.check or arguments.out
-    statistics = folder.with_name(f"{folder.name}_statistics.txt")  # the folder holds the data set alone
+    statistics = folder.parent / f"{folder.name}_statistics.txt"  # the folder holds the data set alone
     if arguments.check:
         _require_left_out(arguments, MAKING, "--check is given")
     else:
