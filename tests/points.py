@@ -1,11 +1,13 @@
-"""Point clouds for tests: the same points in every format that is read."""
+"""Point clouds and meshes for tests: the same points in every format that is read."""
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import laspy
 import numpy as np
 import plyfile
+import trimesh
 
 
 def points_of(heights: np.ndarray, cell: float, west: float = 0.0, south: float = 0.0) -> np.ndarray:
@@ -38,7 +40,7 @@ def write_ply(path: Path, points: np.ndarray, kind: str = "f8", elements=(), **o
 
 
 def write_las(
-    path: Path, points: np.ndarray, scale: float = 2**-6, records=(), point_format: int = 3, **fields
+    path: Path, points: np.ndarray, scale: float = 2**-7, records=(), point_format: int = 3, **fields
 ) -> Path:
     """Coordinates to multiples of the scale; fields are other dimensions of the points, records go into the header."""
     header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
@@ -49,6 +51,92 @@ def write_las(
     for name, values in fields.items():
         setattr(file, name, values)
     file.write(path)
+    return path
+
+
+def write_pcd(path: Path, points: np.ndarray, data: str = "binary", kind: str = "f8", viewpoint: str = "") -> Path:
+    """With a field before and after the coordinates, one of them of three numbers."""
+    names = [("normal", kind, (3,)), ("x", kind), ("y", kind), ("z", kind), ("label", "u1")]
+    table = np.zeros(len(points), names)
+    for axis, values in zip("xyz", points.T, strict=True):
+        table[axis] = values
+    size, letter = np.dtype(kind).itemsize, np.dtype(kind).kind.upper()
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS normal x y z label\n"
+        f"SIZE {size} {size} {size} {size} 1\nTYPE {letter} {letter} {letter} {letter} U\nCOUNT 3 1 1 1 1\n"
+        f"WIDTH {len(points)}\nHEIGHT 1\n{viewpoint}POINTS {len(points)}\nDATA {data}\n"
+    ).encode()
+    if data == "ascii":
+        body = "".join(f"0 0 0 {x:.9g} {y:.9g} {z:.9g} 1\n" for x, y, z in points.tolist()).encode()
+    elif data == "binary":
+        body = table.tobytes()
+    else:
+        columns = b"".join(np.ascontiguousarray(table[name[0]]).tobytes() for name in names)
+        folded = lzf_folded(columns)
+        body = struct.pack("<II", len(folded), len(columns)) + folded
+    path.write_bytes(header + body)
+    return path
+
+
+def lzf_folded(content: bytes) -> bytes:
+    """LZF as LibLZF writes it: literals, and copies of what lies up to 8192 bytes back, short and long ones."""
+    out, literals, at, seen = bytearray(), bytearray(), 0, {}
+
+    def flush():
+        for start in range(0, len(literals), 32):
+            some = literals[start : start + 32]
+            out.extend([len(some) - 1, *some])
+        literals.clear()
+
+    while at < len(content):
+        key = content[at : at + 3]
+        back = at - seen.get(key, -10_000)
+        seen[key] = at
+        if len(key) == 3 and back <= 8192:
+            length = 3
+            while length < 264 and at + length < len(content) and content[at + length] == content[at + length - back]:
+                length += 1
+            flush()
+            high, low = divmod(back - 1, 256)
+            more = length - 2
+            out.extend([(more << 5) + high, low] if more < 7 else [(7 << 5) + high, more - 7, low])
+            at += length
+        else:
+            literals.append(content[at])
+            at += 1
+    flush()
+    return bytes(out)
+
+
+def triangles_of(points: np.ndarray) -> np.ndarray:
+    """The triangles [m, 3] between points on a square lattice, each a number of a point."""
+    cell = np.diff(np.unique(points[:, 0]))[0]
+    col, row = np.rint((points[:, :2] - points[:, :2].min(axis=0)) / cell).astype(int).T
+    number = np.full((row.max() + 1, col.max() + 1), -1)
+    number[row, col] = np.arange(len(points))
+    corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+    pairs = [np.stack([corners[i].ravel() for i in three], axis=1) for three in ((0, 1, 2), (0, 2, 3))]
+    faces = np.concatenate(pairs)
+    return faces[(faces >= 0).all(axis=1)]
+
+
+def write_obj(path: Path, points: np.ndarray, faces: np.ndarray | None = None) -> Path:
+    """With a material library that is not there."""
+    faces = triangles_of(points) if faces is None else faces
+    lines = ["# OBJ", "mtllib none.mtl", *(f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()), "usemtl rock"]
+    path.write_text("\n".join([*lines, *(f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist())]) + "\n")
+    return path
+
+
+def write_mesh(path: Path, points: np.ndarray) -> Path:
+    """STL, or glTF with y up as it has to be, by trimesh."""
+    vertices = points[:, [0, 2, 1]] * [1, 1, -1] if path.suffix in (".glb", ".gltf") else points
+    mesh = trimesh.Trimesh(vertices, triangles_of(points), process=False)
+    if path.suffix == ".gltf":
+        files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)
+        path.write_bytes(files["model.gltf"])
+    else:
+        path.write_bytes(mesh.export(file_type=path.suffix[1:]))
     return path
 
 
@@ -63,5 +151,17 @@ CLOUDS: dict[str, tuple[str, Callable[[Path, np.ndarray], Path]]] = {
     "LAS": ("site.las", write_las),
     "LAS 1.4": ("site.las", lambda path, points: write_las(path, points, point_format=6)),
     "LAZ": ("site.laz", write_las),
+    "LAZ 1.4": ("site.laz", lambda path, points: write_las(path, points, point_format=6)),
+    "PCD": ("site.pcd", write_pcd),
+    "PCD, text": ("site.pcd", lambda path, points: write_pcd(path, points, "ascii")),
+    "PCD, compressed": ("site.pcd", lambda path, points: write_pcd(path, points, "binary_compressed")),
 }
-"""A file name and a writer for each format."""
+"""A file name and a writer for each format of points."""
+
+MESHES: dict[str, tuple[str, Callable[[Path, np.ndarray], Path]]] = {
+    "OBJ": ("site.obj", write_obj),
+    "STL": ("site.stl", write_mesh),
+    "GLB": ("site.glb", write_mesh),
+    "glTF": ("site.gltf", write_mesh),
+}
+"""A file name and a writer for each format of meshes; the points stand on a lattice."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from travjax.clouds import SUFFIXES, read_cloud
 from travjax.config import InputError, require, require_number
+from travjax.dem_options import DemOptions
 from travjax.files import sha256
 from travjax.grid import Grid
 from travjax.raster import (
@@ -137,8 +138,15 @@ def _read(path: Path, cell_size: float | None, scale: float | None, nodata: floa
     if path.suffix.lower() in (".npy", ".npz"):
         return _read_numpy(path, cell_size, scale, nodata)
     if path.suffix.lower() in SUFFIXES:
-        return [read_cloud(path, cell_size, scale, nodata, grid)]
+        return [read_cloud(path, _form(path), DemOptions(cell_size, scale, nodata), grid)]
     return [_read_raster(path, cell_size, scale, nodata)]
+
+
+def _form(path: Path) -> str:
+    suffix = path.suffix.lower()
+    forms = {".ply": "ply", ".las": "las", ".laz": "las", ".pcd": "pcd"}
+    mesh = suffix in (".obj", ".stl", ".gltf", ".glb")
+    return "mesh" if mesh else forms.get(suffix, "text")
 
 
 def _read_numpy(path: Path, cell_size: float | None, scale: float | None, nodata: float | None) -> list[Raster]:
