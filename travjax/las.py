@@ -114,8 +114,10 @@ def _records(file: BinaryIO, start: int, end: int, count: int, header: int) -> d
     """The first record of each number, of those about coordinate systems and LASzip, between two places."""
     found: dict[int, bytes] = {}
     for number in range(count):
-        file.seek(start)
-        described = file.read(header) if start + header <= end else b""
+        described = b""
+        if start + header <= end:
+            file.seek(start)
+            described = file.read(header)
         if len(described) < header:
             raise InputError(f"records = {count}: must lie between header and points; number {number + 1} is cut short")
         user, code = described[2:18].rstrip(b"\0"), int.from_bytes(described[18:20], "little")

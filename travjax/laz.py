@@ -20,6 +20,9 @@ EXTRA_BYTES = (0, 14)
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Number of lengths that a chunk of layered items begins with, for each kind; of extra bytes one a byte."""
 
+MOST_POINTS = 2**22
+"""Points of a chunk, which are in memory at once; LASzip writes 50,000."""
+
 POINTWISE_CHUNKED, LAYERED = 2, 3
 VARIABLE = 2**32 - 1
 """Points of a chunk that says itself how many it has."""
@@ -52,9 +55,10 @@ def require_decompressible(
         raise InputError(
             f"cannot be read as LAZ: chunk table: {reason_of(error)}; it is cut short or damaged"
         ) from None
-    held = sum(number for number, _ in entries)
-    if chunk_points != VARIABLE:
-        held = len(entries) * chunk_points
+    each = [number if chunk_points == VARIABLE else chunk_points for number, _ in entries]
+    held = sum(each)
+    if max(each, default=0) > MOST_POINTS:
+        raise InputError(f"points of a chunk = {max(each)}: must be at most {MOST_POINTS}")
     if held < points or sum(length for _, length in entries) > table - start - 8:
         raise InputError(f"points = {points}: must be in its {len(entries)} chunks; it is cut short or damaged")
     if compressor == LAYERED:
