@@ -7,7 +7,15 @@ from pathlib import Path
 import laspy
 import numpy as np
 import plyfile
+import pytest
 import trimesh
+
+from travjax.clouds import read_cloud
+from travjax.config import InputError
+from travjax.dem import load_dem
+from travjax.dem_options import DemOptions
+from travjax.grid import Grid
+from travjax.raster import Raster
 
 
 def points_of(heights: np.ndarray, cell: float, west: float = 0.0, south: float = 0.0) -> np.ndarray:
@@ -165,3 +173,57 @@ MESHES: dict[str, tuple[str, Callable[[Path, np.ndarray], Path]]] = {
     "glTF": ("site.gltf", write_mesh),
 }
 """A file name and a writer for each format of meshes; the points stand on a lattice."""
+
+
+# ---- How they are read
+
+CELL = 0.0625
+WEST, SOUTH = 5000.25, 7000.5
+SMALL = Grid(1.0, CELL)
+"""Windows of 17 x 17 nodes."""
+
+
+def read(path: Path, cell_size=None, scale=None, nodata=None, grid: Grid = SMALL, **more) -> Raster:
+    return read_cloud(path, form_of(path), DemOptions(cell_size, scale, nodata, **more), grid)
+
+
+def form_of(path: Path) -> str:
+    """What `read_cloud` is to be told about a file of a usual suffix."""
+    forms = {".ply": "ply", ".las": "las", ".laz": "las", ".pcd": "pcd"}
+    mesh = path.suffix.lower() in (".obj", ".stl", ".gltf", ".glb")
+    return "mesh" if mesh else forms.get(path.suffix.lower(), "text")
+
+
+def uneven(rows: int, cols: int) -> np.ndarray:
+    """Values that are all different and multiples of 1/64."""
+    return np.random.default_rng(0).permutation(rows * cols).reshape(rows, cols) / 64
+
+
+def cloud(number: int, size: float = 2.0, seed: int = 0, at=(0.0, 0.0)) -> np.ndarray:
+    """Points [n, 3] anywhere on a rough slope."""
+    x, y = size * np.random.default_rng(seed).random((2, number))
+    return np.stack([x + at[0], y + at[1], 2 + 0.4 * y - 0.2 * x + 0.3 * np.sin(5 * x)], axis=1)
+
+
+def saved(folder: Path, points: np.ndarray, name: str = "site.npy") -> Path:
+    """The fastest way to a file of arbitrary points: PLY in double precision."""
+    return write_ply((folder / name).with_suffix(".ply"), points)
+
+
+def refusal(path: Path, **options) -> str:
+    """The one line that says what is wrong, less the name of the file that it starts with."""
+    with pytest.raises(InputError) as raised:
+        load_dem(path, grid=SMALL, **options)
+    message = str(raised.value)
+    assert message.startswith(f"{path}: ")
+    assert len(message.splitlines()) == 1
+    return message.removeprefix(f"{path}: ")
+
+
+def line_of(path: Path, **options) -> str:
+    """The one line of `read_cloud`, which takes all options."""
+    with pytest.raises(InputError) as raised:
+        read(path, **options)
+    message = str(raised.value)
+    assert len(message.splitlines()) == 1 and message.isprintable()
+    return message

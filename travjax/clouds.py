@@ -16,7 +16,7 @@ from travjax.las import read_las
 from travjax.meshes import read_mesh, surface
 from travjax.pcd import read_pcd
 from travjax.ply import read_ply
-from travjax.points import Points, ground_of, require_fine_steps, whole_classes
+from travjax.points import Points, ground_of, listed, require_fine_steps, whole_classes
 from travjax.raster import Raster, require_heights, require_size
 from travjax.text_points import read_text
 
@@ -61,7 +61,7 @@ def cloud_of_arrays(arrays: dict[str, np.ndarray], options: DemOptions, grid: Gr
     elif {"x", "y", "z"} <= set(arrays):
         x, y, z = (arrays[axis] for axis in "xyz")
     else:
-        raise InputError(f"no array `points`, nor x, y, z; it holds: {', '.join(arrays)[:80] or 'nothing'}")
+        raise InputError(f"no array `points`, nor x, y, z; it holds: {listed(arrays)}")
     classes = arrays.get("classification")
     given = {"x": x, "y": y, "z": z} | ({} if classes is None else {"classification": classes})
     for name, values in given.items():
@@ -76,18 +76,19 @@ def cloud_of_arrays(arrays: dict[str, np.ndarray], options: DemOptions, grid: Gr
 
 
 def _of_points(points: Points, options: DemOptions, grid: Grid) -> Raster:
-    points = ground_of(points, options.classes)
+    stated, points = points.notes, ground_of(points, options.classes)
     x, y, z, known = _in_metres(points, options.up, options)
     x, y, z = x[known], y[known], z[known]
     _require_site(x, y, z, grid)
     require_metric(points.crs, float(np.median(x)), float(np.median(y)), options.height_scale is not None)
-    flat = options.up is None and _lies_along_z(x, y, z)
+    hints = points.notes[len(stated) :]
+    if options.up is None and _lies_along_z(x, y, z):
+        hints += (Y_UP,)
     try:
         raster = gridded(x, y, z, options.cell_size, grid)
     except InputError as error:
-        raise InputError(f"{error}; {Y_UP}" if flat else str(error)) from None
-    notes = (*points.notes, *raster.notes, *((Y_UP,) if flat else ()))
-    return Raster(raster.heights, raster.cell_size, raster.origin, name_of(points.crs), notes)
+        raise InputError("; ".join([str(error), *hints])) from None
+    return Raster(raster.heights, raster.cell_size, raster.origin, name_of(points.crs), stated + hints + raster.notes)
 
 
 def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:

@@ -30,6 +30,9 @@ OFF_NODE = 0.1
 SAME_LEVEL = 1e-4
 """Metres: coordinates that are nearer than that are the same with another rounding."""
 
+LEAST_KNOWN = 1e-3
+"""Share of the cells that there must be points for."""
+
 FEW = 0.05
 """Share of the points that may lie apart from the others and be left out; where there are more, they are the site."""
 
@@ -48,7 +51,9 @@ def gridded(x: np.ndarray, y: np.ndarray, z: np.ndarray, cell_size: float | None
     if raster is None:
         _require_own_places(x, y, cell_size)
         cell_size = cell_size or _cell_size(x, y, grid.spacing)
-        require_fits(float(np.ptp(x)), float(np.ptp(y)), cell_size, grid.spacing)
+        east, north = float(np.ptp(x)), float(np.ptp(y))
+        require_fits(east, north, cell_size, grid.spacing)
+        _require_dense(len(z), (east / cell_size + 1) * (north / cell_size + 1), cell_size)
         raster = _averaged(x, y, z, cell_size)
     else:
         agreed_cell_size(raster.cell_size, cell_size)
@@ -68,6 +73,15 @@ def require_fits(east: float, north: float, cell_size: float, spacing: float) ->
                 f"size = {east:g} x {north:g} m: must be at most {most} {name} of {edge:g} m; is a point astray? "
                 "cut the site out"
             )
+
+
+def _require_dense(points: int, cells: float, cell_size: float) -> None:
+    """Refuses so few points that hardly any cell has one."""
+    if points < LEAST_KNOWN * cells:
+        raise InputError(
+            f"points = {points}: must be at least {LEAST_KNOWN:.1%} of the {cells:.0f} cells of {cell_size:g} m; are "
+            "points astray?"
+        )
 
 
 def _fewest(cell_size: float, grid: Grid) -> int:
@@ -120,11 +134,12 @@ def _apart(x, y, z, grid: Grid, notes: list[str]):
             break
     if kept.all():
         return x, y, z
-    astray = int(np.flatnonzero(~kept)[0])
-    away = np.hypot(*(max(v[kept].min() - v[astray], v[astray] - v[kept].max(), 0.0) for v in (x, y)))
+    beside = [np.maximum(np.maximum(v[kept].min() - v[~kept], v[~kept] - v[kept].max()), 0) for v in (x, y)]
+    away = np.hypot(*beside)
+    farthest = int(np.argmax(away))
     notes.append(
-        f"{_points(~kept)} apart from all others left out, as at x, y = {x[astray]:.10g}, "
-        f"{y[astray]:.10g}, {away:.4g} m beside the site"
+        f"{_points(~kept)} apart from all others left out, as at x, y = {x[~kept][farthest]:.10g}, "
+        f"{y[~kept][farthest]:.10g}, {away[farthest]:.4g} m beside the site"
     )
     return x[kept], y[kept], z[kept]
 
@@ -159,7 +174,7 @@ def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, notes: list[str]) -> R
     number = [np.rint(values[on]).astype(np.int64) for values in (col, row)]
     first_col, first_row = (int(values.min()) for values in number)
     cols, rows = (int(np.ptp(values)) + 1 for values in number)
-    if cols * rows > MOST_CELLS:
+    if cols * rows > MOST_CELLS or len(z) < LEAST_KNOWN * cols * rows:
         return None
     heights, several = _at_nodes((number[1] - first_row) * cols + number[0] - first_col, z[on], rows * cols)
     known = ~np.isnan(heights).reshape(rows, cols)

@@ -90,6 +90,8 @@ def _placed(scene: Any, node: Any) -> tuple[np.ndarray, np.ndarray]:
     vertices = np.asarray(geometry.vertices, np.float64)
     if not np.array_equal(transform, np.eye(4)):
         vertices = vertices @ transform[:3, :3].T + transform[:3, 3]
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise ValueError(f"vertices: {list(vertices.shape)}: must be x, y, z")
     faces = np.asarray(getattr(geometry, "faces", ()), np.int64).reshape(-1, 3)
     if faces.size and not 0 <= faces.min() <= faces.max() < len(vertices):
         raise ValueError(f"a face names vertex {faces.max()} of {len(vertices)}")

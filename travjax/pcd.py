@@ -7,7 +7,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from travjax.config import InputError
-from travjax.points import Points, reason_of
+from travjax.points import Points, listed, reason_of
 
 LONGEST_HEADER = 2**16
 """Bytes."""
@@ -44,7 +44,7 @@ def read_pcd(path: Path) -> Points:
         layout = _header(file)
         names = [name.lower() if count == 1 else "" for name, _, count in layout.fields]
         if not {"x", "y", "z"} <= set(names):
-            raise InputError(f"FIELDS: must hold numbers x, y, z; it holds: {', '.join(filter(None, names))[:80]}")
+            raise InputError(f"FIELDS: must hold numbers x, y, z; it holds: {listed(names)}")
         columns = [names.index(axis) for axis in "xyz"]
         left = path.stat().st_size - file.tell()
         if layout.data == "ascii":
@@ -99,12 +99,12 @@ def _require_room(layout: Layout, size: int) -> None:
 
 
 def _text(file: BinaryIO, layout: Layout, columns: list[int], left: int) -> np.ndarray:
-    starts = np.concatenate([[0], np.cumsum([count for _, _, count in layout.fields])])
+    starts = [0, *itertools.accumulate(count for _, _, count in layout.fields)]
     if layout.points * 2 * starts[-1] > left + 1:
         raise InputError(f"POINTS = {layout.points}: must fit into its {left} bytes of them; it is cut short")
     lines = itertools.islice((line.decode("ascii", "replace") for line in file if not line.isspace()), layout.points)
     try:
-        used = [int(starts[column]) for column in columns]
+        used = [starts[column] for column in columns]
         rows = np.loadtxt(lines, usecols=used, ndmin=2, comments=None) if layout.points else np.zeros((0, 3))
     except ValueError as error:
         raise InputError(f"cannot be read as PCD: {reason_of(error)}") from None

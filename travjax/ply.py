@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from travjax.config import InputError
-from travjax.points import Points, reason_of, whole_classes
+from travjax.points import Points, listed, printable, reason_of, whole_classes
 
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
@@ -65,7 +65,7 @@ def read_ply(path: Path) -> Points:
         order, elements = _header(file)
         names = [element.name for element in elements]
         if "vertex" not in names:
-            raise InputError(f"no element `vertex`; it holds: {', '.join(names)[:80] or 'nothing'}")
+            raise InputError(f"no element `vertex`; it holds: {listed(names)}")
         vertex = elements[names.index("vertex")]
         columns = _wanted(vertex)
         _pass_mark(file, order, elements, path.stat().st_size)
@@ -97,7 +97,7 @@ def _header(file: BinaryIO) -> tuple[str, list[Element]]:
                 pass
             case ["format", name, *_] if name in ORDERS:
                 order = ORDERS[name]
-            case ["element", *name, count] if name and count.isdecimal() and len(count) < 25:
+            case ["element", *name, count] if name and count.isdecimal() and len(count) < 30:
                 elements.append(Element(" ".join(name), int(count)))
             case ["property", "list", length, kind, *name] if elements and {length, kind} <= set(TYPES):
                 elements[-1].properties.append((" ".join(name).lower(), TYPES[kind], TYPES[length]))
@@ -106,7 +106,7 @@ def _header(file: BinaryIO) -> tuple[str, list[Element]]:
             case _ if words or not line or file.tell() > LONGEST_HEADER:
                 shown = " ".join(words)[:60]
                 raise InputError(
-                    f"cannot be read as PLY: line {number + 1} of its header is {shown!r}; it is cut short"
+                    f"cannot be read as PLY: line {number + 1} of its header: {shown!r}: must be one of PLY"
                 )
     if order is None:
         raise InputError(f"cannot be read as PLY: format: must be one of {', '.join(ORDERS)}")
@@ -118,7 +118,7 @@ def _wanted(vertex: Element) -> dict[str, int]:
     names = [name if not length else "" for name, _, length in vertex.properties]
     found = {axis: names.index(name) for axis, known in COLUMNS.items() for name in known if name in names}
     if not {"x", "y", "z"} <= set(found):
-        raise InputError(f"vertex: must have numbers x, y, z; it has: {', '.join(filter(None, names))[:80] or 'none'}")
+        raise InputError(f"vertex: must have numbers x, y, z; it has: {listed(names)}")
     return found
 
 
@@ -139,14 +139,14 @@ def _require_room(elements: list[Element], order: str, size: int) -> None:
     needed = sum(element.count * element.least(order) for element in elements)
     if needed > size + 1:  # the last line of a text may lack its end
         counts = ", ".join(f"{element.name} {element.count}" for element in elements)
-        raise InputError(f"elements = {counts[:80]}: must fit into its {size} bytes of them; it is cut short")
+        raise InputError(f"elements = {printable(counts[:80])}: must fit into {size} bytes; it is cut short")
 
 
 def _pass_over(file: BinaryIO, order: str, element: Element) -> None:
     if not order:
         for _ in range(element.count):
             if not file.readline():
-                raise InputError(f"cannot be read as PLY: {element.name}: it is cut short")
+                raise InputError(f"cannot be read as PLY: {printable(element.name[:40])}: it is cut short")
         return
     start = file.tell()
     if _table(file, order, element) is not None:
@@ -180,7 +180,7 @@ def _table(file: BinaryIO, order: str, element: Element) -> np.ndarray | None:
 def _read(file: BinaryIO, dtype: np.dtype, count: int, name: str) -> np.ndarray:
     table = np.fromfile(file, dtype, count)
     if len(table) < count:
-        raise InputError(f"cannot be read as PLY: {name}: it is cut short")
+        raise InputError(f"cannot be read as PLY: {printable(name[:40])}: it is cut short")
     return table
 
 

@@ -1,5 +1,6 @@
 """Points of a cloud as a file holds them, and what is left out of them before they are gridded (SPEC section 11)."""
 
+from collections.abc import Iterable
 from importlib import import_module
 from types import ModuleType
 from typing import NamedTuple
@@ -47,7 +48,17 @@ def installed(module: str, package: str = "") -> ModuleType:
 def reason_of(error: BaseException) -> str:
     """Returns why a library could not read a file, as one short line."""
     lines = str(error).strip().splitlines()
-    return lines[0][:160] if lines else type(error).__name__
+    return printable(lines[0][:160]) if lines else type(error).__name__
+
+
+def printable(text: str) -> str:
+    """Returns what a file holds with its unprintable characters as question marks."""
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
+def listed(names: Iterable[str]) -> str:
+    """Returns the names of what a file holds, at most 80 characters of them."""
+    return printable(", ".join(filter(None, names))[:80]) or "nothing"
 
 
 def whole_classes(values: np.ndarray | None) -> np.ndarray | None:

@@ -193,7 +193,7 @@ def _with_units(fields: list[str]) -> list[str]:
 
 def _is_number(field: str) -> bool:
     try:
-        float(field.replace(",", ".").replace("d", "e"))
+        float(field.lower().replace(",", ".").replace("d", "e"))
     except ValueError:
         return False
     return True
