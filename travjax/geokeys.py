@@ -76,7 +76,8 @@ def _keys(directory: bytes, doubles: bytes) -> Keys:
 
 
 def _horizontal(keys: Keys) -> CRS | None:
-    model = keys.get(MODEL, 0)
+    alone = GEODETIC in keys and not keys.keys() & {PROJECTED, METHOD}
+    model = keys.get(MODEL, 2 if alone else 1)
     if model == 3:
         raise InputError("crs: is geocentric: its z is no height; convert it to metres (a UTM zone, say) first")
     code = int(keys.get(PROJECTED if model != 2 else GEODETIC, 0))

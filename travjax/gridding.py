@@ -33,6 +33,9 @@ SAME_LEVEL = 1e-4
 LEAST_KNOWN = 1e-3
 """Share of the cells that there must be points for."""
 
+Scale = tuple[float, float]
+"""One of the levels that coordinates stand on, and the step between these; 0 where there is none."""
+
 FEW = 0.05
 """Share of the points that may lie apart from the others and be left out; where there are more, they are the site."""
 
@@ -47,9 +50,10 @@ def gridded(x: np.ndarray, y: np.ndarray, z: np.ndarray, cell_size: float | None
     for chosen in (_repeated, _at_the_origin, _apart):
         x, y, z = chosen(x, y, z, grid, notes)
     require_size(float(np.ptp(x)), float(np.ptp(y)), grid)
-    raster = _lattice(x, y, z, notes)
+    axes = [_regular(values) for values in (x, y)]
+    raster = _lattice(x, y, z, axes, notes)
     if raster is None:
-        _require_own_places(x, y, cell_size)
+        _require_own_places(x, y, axes, cell_size)
         cell_size = cell_size or _cell_size(x, y, grid.spacing)
         east, north = float(np.ptp(x)), float(np.ptp(y))
         require_fits(east, north, cell_size, grid.spacing)
@@ -123,6 +127,8 @@ def _apart(x, y, z, grid: Grid, notes: list[str]):
     while True:
         before = np.count_nonzero(kept)
         for values in (x, y):
+            if _is_filled(values[kept], width):
+                continue
             ordered = np.sort(values[kept])
             wide = np.flatnonzero(np.diff(ordered) > width)
             group = np.searchsorted((ordered[wide] + ordered[wide + 1]) / 2, values)
@@ -144,6 +150,12 @@ def _apart(x, y, z, grid: Grid, notes: list[str]):
     return x[kept], y[kept], z[kept]
 
 
+def _is_filled(values: np.ndarray, width: float) -> bool:
+    """Whether each half of a width holds a value, so that no gap is as wide: quicker than to sort them."""
+    first, extent = values.min(), np.ptp(values)
+    return extent < 1e5 * width and bool(np.bincount(((values - first) / (width / 2)).astype(np.int64)).all())
+
+
 def _points(chosen: np.ndarray) -> str:
     number = np.count_nonzero(chosen)
     return f"{number} point{'' if number == 1 else 's'}"
@@ -158,14 +170,16 @@ def _point_spacing(x: np.ndarray, y: np.ndarray) -> float:
 # ---- Lattices
 
 
-def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, notes: list[str]) -> Raster | None:
+def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, axes: list[Scale], notes: list[str]) -> Raster | None:
     """The raster that the bulk of the points is, if most nodes have a neighbour one step east; None of other points.
 
     Points off the nodes are left out, several heights of a node averaged.
     """
-    axes = [_regular(values) for values in (x, y)]
     (west, across), (south, along) = axes
     if not across * along or abs(across - along) > 1e-3 * across:
+        return None
+    nodes = (np.ptp(x) / across + 1) * (np.ptp(y) / along + 1)
+    if nodes > MOST_CELLS or len(z) < LEAST_KNOWN * nodes:
         return None
     col, row = ((values - first) / step for values, (first, step) in zip((x, y), axes, strict=True))
     on = np.maximum(np.abs(col - np.rint(col)), np.abs(row - np.rint(row))) < OFF_NODE
@@ -174,8 +188,6 @@ def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, notes: list[str]) -> R
     number = [np.rint(values[on]).astype(np.int64) for values in (col, row)]
     first_col, first_row = (int(values.min()) for values in number)
     cols, rows = (int(np.ptp(values)) + 1 for values in number)
-    if cols * rows > MOST_CELLS or len(z) < LEAST_KNOWN * cols * rows:
-        return None
     heights, several = _at_nodes((number[1] - first_row) * cols + number[0] - first_col, z[on], rows * cols)
     known = ~np.isnan(heights).reshape(rows, cols)
     nodes, beside = np.count_nonzero(known), np.count_nonzero(known[:, 1:] & known[:, :-1])
@@ -208,7 +220,7 @@ def _several_by_chance(filled: float) -> float:
     return float(1 - a_cell * (1 - filled) / filled)
 
 
-def _regular(values: np.ndarray) -> tuple[float, float]:
+def _regular(values: np.ndarray) -> Scale:
     """(a level, step) of the regular scale that values stand on but for rounding, a few apart; step 0 of others.
 
     Of the steps that the rounding leaves room for, the one with the fewest digits.
@@ -255,9 +267,9 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # ---- Averages
 
 
-def _require_own_places(x: np.ndarray, y: np.ndarray, cell_size: float | None) -> None:
+def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_size: float | None) -> None:
     """Refuses coordinates rounded so far that many points share a place with others."""
-    steps = [_regular(values)[1] for values in (x, y)]
+    steps = [step for _, step in axes]
     coarsest = max(steps)
     if coarsest < COARSEST_STEP + 1e-9 or (cell_size or 0) > coarsest - 1e-9:
         return

@@ -124,7 +124,7 @@ def _records(file: BinaryIO, start: int, end: int, count: int, header: int) -> d
         length = int.from_bytes(described[20 : 22 if header == 54 else 28], "little")
         if start + header + length > end:
             raise InputError(f"record {number + 1} = {length} bytes: must lie in the file; it is cut short")
-        if user in (b"LASF_Projection", b"laszip encoded"):
+        if user in (b"LASF_Projection", b"liblas", b"laszip encoded"):
             content = file.read(length)
             if content.strip(b"\0 "):
                 found.setdefault(code, content)

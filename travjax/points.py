@@ -1,5 +1,6 @@
 """Points of a cloud as a file holds them, and what is left out of them before they are gridded (SPEC section 11)."""
 
+import logging
 from collections.abc import Iterable
 from importlib import import_module
 from types import ModuleType
@@ -39,6 +40,9 @@ class Points(NamedTuple):
 
 def installed(module: str, package: str = "") -> ModuleType:
     """Imports a library that only some formats need; raises InputError that says what to install."""
+    logger = logging.getLogger(module)
+    if not logger.handlers:
+        logger.addHandler(logging.NullHandler())  # what it says about a file is in our own line
     try:
         return import_module(module)
     except ImportError:
@@ -127,9 +131,9 @@ def without_repeats(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         mixed ^= mixed >> np.uint64(32)
     kept = np.ones(len(x), bool)
     ordered = np.sort(mixed)
-    shared = ordered[1:][ordered[1:] == ordered[:-1]]
+    shared = np.unique(ordered[1:][ordered[1:] == ordered[:-1]])
     if shared.size:
-        here = np.flatnonzero(np.isin(mixed, shared))
+        here = np.flatnonzero(shared[np.minimum(np.searchsorted(shared, mixed), len(shared) - 1)] == mixed)
         order = here[np.lexsort((z[here], y[here], x[here]))]
         again = np.all([values[order[1:]] == values[order[:-1]] for values in (x, y, z)], axis=0)
         kept[order[1:][again]] = False
