@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from points import CELL, SOUTH, WEST, points_of, read, refusal, uneven, write_text
+from points import CELL, SOUTH, WEST, line_of, points_of, read, refusal, uneven, write_text
 
 from travjax.clouds import SUFFIXES
 from travjax.grid import Grid
@@ -102,7 +102,7 @@ def test_a_text_that_is_no_cloud_is_refused(tmp_path, content, line):
 def test_bytes_that_are_no_cloud_are_refused(tmp_path, suffix, content):
     path = tmp_path / f"site{suffix}"
     path.write_bytes(content)
-    assert refusal(path).startswith(("cannot be read as", "version = 0.0: must be 1.0 to 1.4"))
+    assert line_of(path).startswith(("cannot be read as", "version = 0.0: must be 1.0 to 1.4"))
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32", "latin-1"])
