@@ -183,9 +183,26 @@ def test_a_cloud_with_rounded_coordinates_is_refused_unless_its_cells_are_as_lar
     path = saved(tmp_path, np.round(points * [10, 10, 1e3]) / [10, 10, 1e3])
     line = refusal(path)
     assert line.startswith("x = ")
-    assert "is given in steps of 0.1 m, and 95% of the points share their place: must be given to 0.01 m" in line
+    assert "is given in steps of 0.1 m, 95% of the points share their place: must be given to 0.01 m" in line
     assert read(path, 0.1).cell_size == 0.1
     assert read(saved(tmp_path, np.round(points, 2))).cell_size == CELL
+
+
+def test_few_points_in_single_precision_are_refused_whatever_their_digits(tmp_path):
+    points = cloud(3000, 12.0, at=(500_000, 5_200_000)).astype(np.float32).astype(float)
+    line = refusal(write_text(tmp_path / "site.xyz", points, form="%.4f"))
+    assert "is given in steps of 0.5 m" in line
+
+
+def test_profiles_on_regular_lines_are_averaged(tmp_path):
+    points = cloud(20_000)
+    assert read(saved(tmp_path, np.round(points * [1e3, 10, 1e3]) / [1e3, 10, 1e3])).cell_size == CELL
+
+
+def test_one_coordinate_of_six_digits_is_refused(tmp_path):
+    points = cloud(9000, 12.0, at=(0, 5_200_000))
+    line = refusal(write_text(tmp_path / "site.xyz", points, form="%.6g"))
+    assert "is given in steps of 10 m" in line
 
 
 def test_a_text_of_six_digits_is_refused(tmp_path):

@@ -76,19 +76,19 @@ def cloud_of_arrays(arrays: dict[str, np.ndarray], options: DemOptions, grid: Gr
 
 
 def _of_points(points: Points, options: DemOptions, grid: Grid) -> Raster:
-    stated, points = points.notes, ground_of(points, options.classes)
+    points = ground_of(points, options.classes)
     x, y, z, known = _in_metres(points, options.up, options)
     x, y, z = x[known], y[known], z[known]
     _require_site(x, y, z, grid)
     require_metric(points.crs, float(np.median(x)), float(np.median(y)), options.height_scale is not None)
-    hints = points.notes[len(stated) :]
+    notes = points.notes
     if options.up is None and _lies_along_z(x, y, z):
-        hints += (Y_UP,)
+        notes += (Y_UP,)
     try:
         raster = gridded(x, y, z, options.cell_size, grid)
     except InputError as error:
-        raise InputError("; ".join([str(error), *hints])) from None
-    return Raster(raster.heights, raster.cell_size, raster.origin, name_of(points.crs), stated + hints + raster.notes)
+        raise InputError("; ".join([str(error), *notes])) from None
+    return Raster(raster.heights, raster.cell_size, raster.origin, name_of(points.crs), notes + raster.notes)
 
 
 def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:

@@ -33,6 +33,9 @@ SAME_LEVEL = 1e-4
 LEAST_KNOWN = 1e-3
 """Share of the cells that there must be points for."""
 
+WIDEST_LINES = 1.0
+"""Metres between lines of points, of which one coordinate is regular and the other is not."""
+
 Scale = tuple[float, float]
 """One of the levels that coordinates stand on, and the step between these; 0 where there is none."""
 
@@ -268,17 +271,18 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_size: float | None) -> None:
-    """Refuses coordinates rounded so far that many points share a place with others."""
+    """Refuses coordinates rounded so far that many points share a place with others, or are nearer than the steps."""
     steps = [step for _, step in axes]
     coarsest = max(steps)
     if coarsest < COARSEST_STEP + 1e-9 or (cell_size or 0) > coarsest - 1e-9:
         return
     shared = 1 - np.mean(without_repeats(x, y, np.zeros(len(x))))
-    if shared > 0.1:
+    rounded = min(steps) > COARSEST_STEP and (shared > 0.1 or coarsest > 2 * _point_spacing(x, y))
+    if rounded or coarsest > WIDEST_LINES:
         name, values = ("x", x) if steps[0] == coarsest else ("y", y)
         raise InputError(
-            f"{name} = {values[0]:.10g}: is given in steps of {coarsest:g} m, and {shared:.0%} of the points share "
-            f"their place: must be given to {COARSEST_STEP:g} m, or put into cells (--cell-size={coarsest:g})"
+            f"{name} = {values[0]:.10g}: is given in steps of {coarsest:g} m, {shared:.0%} of the points share their "
+            f"place: must be given to {COARSEST_STEP:g} m, or put into cells (--cell-size={coarsest:g})"
         )
 
 

@@ -74,7 +74,11 @@ def read_ply(path: Path) -> Points:
             _pass_over(file, order, element)
         values = _values(file, order, vertex, columns)
     faces = sum(element.count for element in elements if element.name == "face")
-    notes = (f"{faces} faces are passed over: its vertices are taken as points",) if faces else ()
+    notes = (
+        (f"{faces} faces are passed over: its vertices are taken as points (of .obj, .stl and .glb the surface)",)
+        if faces
+        else ()
+    )
     return Points(values["x"], values["y"], values["z"], classes=whole_classes(values.get("classes")), notes=notes)
 
 

@@ -42,7 +42,7 @@ MATRIX = "; a matrix of heights is given as .npy with --cell-size"
 MARKS = {b"\xff\xfe\0\0": "utf-32", b"\0\0\xfe\xff": "utf-32", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 """Bytes that a text in other than UTF-8 begins with."""
 
-COMMENT = ("#", "//")
+COMMENT = ("#", "//", "%", "!")
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([ed][+-]?\d+)?", re.IGNORECASE)
 
 
@@ -122,7 +122,7 @@ def _beginning(file: TextIO) -> Beginning:
         elif sum(_is_number(field.strip(' "')) for field in text.split(_separator(text))) >= 3:
             return Beginning(number, stated, header, text)
         elif text:
-            header = text
+            header = _with_units_below(header, fields) or text
     raise AssertionError
 
 
@@ -161,7 +161,7 @@ def _width(line: str, separator: str | None) -> int:
 
 def _fields(line: str) -> list[str]:
     """The columns of a line, without quotes and case; tabs part names that hold blanks."""
-    line = line.strip().lstrip("#/").strip().lower()
+    line = line.strip().lstrip("#/%!").strip().lower()
     separator = _separator(line) or ("\t" if "\t" in line else None)
     if separator is None and '"' in line:
         return [field.strip('" ') for field in re.findall(r'"[^"]*"|\S+', line)]
@@ -178,6 +178,14 @@ def _names(header: str, columns: int) -> list[str]:
     if words > 1 and not rest:
         fields = [" ".join(fields[words * column : words * (column + 1)]) for column in range(columns)]
     return fields
+
+
+def _with_units_below(header: str, fields: list[str]) -> str:
+    """A header whose names carry the units that stand in the line below it; "" where these are none."""
+    names = _fields(header)
+    units = len(fields) == len(names) and all(_unit(f"z [{field}]") or field in DEGREES for field in fields)
+    pairs = zip(names, fields, strict=False)
+    return ";".join(f"{name} [{unit}]" for name, unit in pairs) if units and _is_header(names) else ""
 
 
 def _with_units(fields: list[str]) -> list[str]:
