@@ -56,8 +56,8 @@ def gridded(x: np.ndarray, y: np.ndarray, z: np.ndarray, cell_size: float | None
     axes = [_regular(values) for values in (x, y)]
     raster = _lattice(x, y, z, axes, notes)
     if raster is None:
-        _require_own_places(x, y, axes, cell_size)
         cell_size = cell_size or _cell_size(x, y, grid.spacing)
+        _require_own_places(x, y, axes, cell_size)
         east, north = float(np.ptp(x)), float(np.ptp(y))
         require_fits(east, north, cell_size, grid.spacing)
         _require_dense(len(z), (east / cell_size + 1) * (north / cell_size + 1), cell_size)
@@ -270,11 +270,11 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 # ---- Averages
 
 
-def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_size: float | None) -> None:
+def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_size: float) -> None:
     """Refuses coordinates rounded so far that many points share a place with others, or are nearer than the steps."""
     steps = [step for _, step in axes]
     coarsest = max(steps)
-    if coarsest < COARSEST_STEP + 1e-9 or (cell_size or 0) > coarsest - 1e-9:
+    if coarsest < COARSEST_STEP + 1e-9 or cell_size > coarsest - 1e-9:
         return
     shared = 1 - np.mean(without_repeats(x, y, np.zeros(len(x))))
     rounded = min(steps) > COARSEST_STEP and (shared > 0.1 or coarsest > 2 * _point_spacing(x, y))
