@@ -20,7 +20,16 @@ def test_x_is_east_and_y_is_north_and_z_is_up(tmp_path):
 
 @pytest.mark.parametrize(
     ("cell", "form"),
-    [(0.1, "%.2f"), (1 / 12, "%.3f"), (0.0625, "%.3f"), (0.125, "%.2f"), (0.1, "%.17g"), (1 / 12, "%.17g")],
+    [
+        (0.1, "%.2f"),
+        (1 / 12, "%.3f"),
+        (0.0625, "%.3f"),
+        (0.125, "%.2f"),
+        (0.05, "%.2f"),
+        (0.0625, "%.2f"),
+        (0.1, "%.17g"),
+        (1 / 12, "%.17g"),
+    ],
 )
 def test_a_lattice_is_found_although_its_coordinates_are_rounded(tmp_path, cell, form):
     heights = np.round(uneven(60, 80))
@@ -52,6 +61,12 @@ def test_points_on_no_lattice_are_averaged(tmp_path, kind):
     raster = read(saved(tmp_path, points), cell_size=0.2)
     assert raster.cell_size == 0.2
     np.testing.assert_allclose(np.array(raster.origin) / 0.2, np.round(np.array(raster.origin) / 0.2), atol=1e-9)
+
+
+def test_a_lattice_may_lack_half_of_its_nodes(tmp_path):
+    heights = KERB.copy()
+    heights[np.random.default_rng(0).random(KERB.shape) < 0.5] = np.nan
+    np.testing.assert_array_equal(read(saved(tmp_path, points_of(heights, CELL))).heights, heights)
 
 
 def test_a_cell_size_that_contradicts_a_lattice_is_refused(tmp_path):

@@ -24,8 +24,8 @@ MOST_NODES = 2**28
 ON_NODES = 0.75
 """Share of the points that stand on a lattice's nodes, at least."""
 
-OFF_NODE = 0.1
-"""Share of a lattice's step that rounding may move a point by."""
+OFF_NODE = 0.3
+"""Share of a lattice's step that rounding may move a column or row by."""
 
 SAME_LEVEL = 1e-4
 """Metres: coordinates that are nearer than that are the same with another rounding."""
@@ -36,8 +36,11 @@ LEAST_KNOWN = 1e-3
 WIDEST_LINES = 1.0
 """Metres between lines of points, of which one coordinate is regular and the other is not."""
 
-Scale = tuple[float, float]
-"""One of the levels that coordinates stand on, and the step between these; 0 where there is none."""
+LEAST_BESIDE = 0.25
+"""Share of a lattice's nodes with a point that have one a step east, at least: half of the nodes may lack one."""
+
+Scale = tuple[float, float, float]
+"""A level that coordinates stand on, the step between levels, 0 where there is none, and how far off they are."""
 
 FEW = 0.05
 """Share of the points that may lie apart from the others and be left out; where there are more, they are the site."""
@@ -174,18 +177,19 @@ def _point_spacing(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, axes: list[Scale], notes: list[str]) -> Raster | None:
-    """The raster that the bulk of the points is, if most nodes have a neighbour one step east; None of other points.
+    """The raster that the bulk of the points is, if enough nodes have a neighbour one step east; None of other points.
 
     Points off the nodes are left out, several heights of a node averaged.
     """
-    (west, across), (south, along) = axes
+    (west, across, _), (south, along, _) = axes
     if not across * along or abs(across - along) > 1e-3 * across:
         return None
     nodes = (np.ptp(x) / across + 1) * (np.ptp(y) / along + 1)
     if nodes > MOST_CELLS or len(z) < LEAST_KNOWN * nodes:
         return None
-    col, row = ((values - first) / step for values, (first, step) in zip((x, y), axes, strict=True))
-    on = np.maximum(np.abs(col - np.rint(col)), np.abs(row - np.rint(row))) < OFF_NODE
+    col, row = ((values - first) / step for values, (first, step, _) in zip((x, y), axes, strict=True))
+    on = np.abs(col - np.rint(col)) * across <= axes[0][2]
+    on &= np.abs(row - np.rint(row)) * along <= axes[1][2]
     if np.count_nonzero(on) < ON_NODES * len(z):
         return None
     number = [np.rint(values[on]).astype(np.int64) for values in (col, row)]
@@ -194,7 +198,7 @@ def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, axes: list[Scale], not
     heights, several = _at_nodes((number[1] - first_row) * cols + number[0] - first_col, z[on], rows * cols)
     known = ~np.isnan(heights).reshape(rows, cols)
     nodes, beside = np.count_nonzero(known), np.count_nonzero(known[:, 1:] & known[:, :-1])
-    if beside < nodes / 2 or several / nodes > _several_by_chance(beside / nodes) / 2:
+    if beside < LEAST_BESIDE * nodes or several / nodes > _several_by_chance(beside / nodes) / 2:
         return None
     if not on.all():
         notes.append(f"{_points(~on)} off the lattice of {across:g} m left out")
@@ -224,13 +228,13 @@ def _several_by_chance(filled: float) -> float:
 
 
 def _regular(values: np.ndarray) -> Scale:
-    """(a level, step) of the regular scale that values stand on but for rounding, a few apart; step 0 of others.
+    """The regular scale that values stand on but for rounding, a few apart; a step of 0 of others.
 
     Of the steps that the rounding leaves room for, the one with the fewest digits.
     """
     levels, held = _levels(values)
     if len(levels) < 2:
-        return float(values[0]), 0.0
+        return float(values[0]), 0.0, 0.0
     usual = np.median(np.diff(levels))
     gaps = np.diff(levels)
     beside = np.zeros(len(levels), bool)  # heavy as it may be, such a level is no column
@@ -240,7 +244,7 @@ def _regular(values: np.ndarray) -> Scale:
     number = np.concatenate([[0], np.cumsum(np.rint(np.diff(levels) / usual))])
     while True:
         if not number[-1] > number[0]:
-            return float(values[0]), 0.0
+            return float(values[0]), 0.0, 0.0
         step = (levels[-1] - levels[0]) / (number[-1] - number[0])
         away = levels - levels[0] - step * (number - number[0])
         off = np.abs(away - np.median(away))
@@ -249,22 +253,28 @@ def _regular(values: np.ndarray) -> Scale:
             break
         levels, number = levels[regular], number[regular]
         if len(levels) < 2:
-            return float(values[0]), 0.0
+            return float(values[0]), 0.0, 0.0
     doubt = 2 * np.abs(away).max() / (number[-1] - number[0]) + 1e-12
     step = next(shorter for digits in range(16) if abs((shorter := round(float(step), digits)) - step) <= doubt)
-    return float(levels[0]), step
+    away = levels - levels[0] - step * (number - number[0])
+    middle = (away.max() + away.min()) / 2
+    return float(levels[0] + middle), step, float(np.ptp(away) / 2 + 0.02 * step)
 
 
 def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(different values, number of points at each), without those that hold far fewer than most points' own do."""
-    levels, held = np.unique(values, return_counts=True)
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(levels) > SAME_LEVEL) + 1])
-    ends = np.concatenate([starts[1:], [len(levels)]]) - 1
-    held = np.add.reduceat(held, starts)
+    """(values that differ, number of points at each), without those that far fewer points hold than most points' own.
+
+    Of values that are nearer than SAME_LEVEL, the most frequent.
+    """
+    found, counts = np.unique(values, return_counts=True)
+    level = np.concatenate([[0], np.cumsum(np.diff(found) > SAME_LEVEL)])
+    by_count = np.lexsort((counts, level))
+    ends = np.flatnonzero(np.diff(level, append=level[-1] + 1))
+    levels, held = found[by_count[ends]], np.bincount(level, counts).astype(np.int64)
     ordered = np.sort(held)
     usual = ordered[np.searchsorted(np.cumsum(ordered), len(values) / 2)]
     heavy = held >= 0.2 * usual
-    return ((levels[starts] + levels[ends]) / 2)[heavy], held[heavy]
+    return levels[heavy], held[heavy]
 
 
 # ---- Averages
@@ -272,7 +282,7 @@ def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_size: float) -> None:
     """Refuses coordinates rounded so far that many points share a place with others, or are nearer than the steps."""
-    steps = [step for _, step in axes]
+    steps = [step for _, step, _ in axes]
     coarsest = max(steps)
     if coarsest < COARSEST_STEP + 1e-9 or cell_size > coarsest - 1e-9:
         return
