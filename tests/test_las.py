@@ -219,6 +219,8 @@ STATED = {
     "unit over the system's": (UTM | {4096: 5703, 4099: 9002}, "crs: GeoKey 4099: has heights in units of 0.3048 m"),
     "unit without a system": ({4099: 9003}, "crs: GeoKey 4099: has heights in units of 0.304801 m"),
     "no known unit": (UTM | {4099: 32767}, "crs: GeoKey 4099 = 32767: must be a known unit of length"),
+    "unit over that of the code": (UTM | {3076: 9002}, "crs: is in units of 0.3048 m (GeoKey 3076); reproject it"),
+    "degrees alone": ({2048: 4326}, "crs = EPSG:4326: is in degrees"),
     "depths": (UTM | {4096: 5706}, "crs = EPSG:5706: has depths, which run down"),
     "geocentric": ({1024: 3, 2048: 4978}, "crs: is geocentric: its z is no height; convert it to metres"),
     "geocentric without a code": ({1024: 3}, "crs: is geocentric: its z is no height"),
@@ -255,6 +257,12 @@ def test_what_geotiff_keys_state_is_heard(tmp_path, monkeypatch, stated, extende
         if "--height-scale=" in message:
             scale = float(message.partition("--height-scale=")[2].rstrip(")"))
             assert np.nanmax(read(path, scale=scale).heights) == pytest.approx(uneven(20, 24).max() * scale)
+
+
+def test_a_height_scale_stands_for_units_that_are_not_known(tmp_path):
+    path = write_las(tmp_path / "site.las", POINTS, records=keys({1024: 1, 4099: 32767}))
+    assert refusal(path).endswith("must be a known unit of length; give metres a unit (--height-scale=METRES)")
+    np.testing.assert_array_equal(read(path, scale=0.5).heights, GROUND_HEIGHTS / 2)
 
 
 def add_extended(path: Path, records: list[laspy.VLR]) -> None:

@@ -81,13 +81,13 @@ def _horizontal(keys: Keys) -> CRS | None:
     if model == 3:
         raise InputError("crs: is geocentric: its z is no height; convert it to metres (a UTM zone, say) first")
     code = int(keys.get(PROJECTED if model != 2 else GEODETIC, 0))
+    metres = None if model == 2 else _unit_metres(keys, UNIT, UNIT_SIZE)
+    if metres is not None and abs(metres - 1) > 1e-9:  # whatever the code says: it is the unit of these coordinates
+        raise InputError(f"crs: is in units of {metres:g} m (GeoKey {UNIT}); reproject it to metres first")
     if 1024 <= code < USER_DEFINED:
         return parsed(code)
     if model == 2:
         raise InputError("crs: is in degrees; reproject it to metres (a UTM zone, say) first")
-    metres = _unit_metres(keys, UNIT, UNIT_SIZE)
-    if metres is not None and abs(metres - 1) > 1e-9:
-        raise InputError(f"crs: is in units of {metres:g} m (GeoKey {UNIT}); reproject it to metres first")
     return _described(keys)
 
 
@@ -106,11 +106,12 @@ def _described(keys: Keys) -> CRS | None:
 
 
 def _require_heights_in_metres(keys: Keys, heights_scaled: bool) -> None:
-    """Refuses heights whose unit, or that of their own system, is another than metres."""
+    """Refuses heights whose unit, or that of their own system, is another than metres, and depths."""
     code = int(keys.get(VERTICAL, 0))
-    metres = _unit_metres(keys, VERTICAL_UNIT, None)
+    metres = None if heights_scaled else _unit_metres(keys, VERTICAL_UNIT, None)
     if metres is not None:
-        require_height_unit(f"crs: GeoKey {VERTICAL_UNIT}", _unit_name(keys), metres, heights_scaled)
+        unit = _units()[int(keys[VERTICAL_UNIT])][1]
+        require_height_unit(f"crs: GeoKey {VERTICAL_UNIT}", unit, metres, heights_scaled)
     if not 1024 <= code < USER_DEFINED:
         return
     try:
@@ -132,12 +133,9 @@ def _unit_metres(keys: Keys, key: int, size: int | None) -> float | None:
     if code == USER_DEFINED and size in keys:
         return float(keys[size])
     if code not in _units():
-        raise InputError(f"crs: GeoKey {key} = {code}: must be a known unit of length")
+        hint = "; give metres a unit (--height-scale=METRES)" if key == VERTICAL_UNIT else ""
+        raise InputError(f"crs: GeoKey {key} = {code}: must be a known unit of length{hint}")
     return _units()[code][0]
-
-
-def _unit_name(keys: Keys) -> str:
-    return _units()[int(keys[VERTICAL_UNIT])][1]
 
 
 @lru_cache(maxsize=1)
