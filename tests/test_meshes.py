@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from points import CELL, MESHES, line_of, points_of, read, refusal, triangles_of, uneven, write_mesh, write_obj
 
 from travjax import meshes
@@ -101,6 +102,31 @@ def test_an_obj_of_points_alone_is_a_cloud(tmp_path):
     raster = read(write_obj(tmp_path / "site.obj", points_of(heights, CELL), np.zeros((0, 3), int)))
     np.testing.assert_array_equal(raster.heights, heights)
     assert raster.notes == ("it has no triangles: its points are taken",)
+
+
+def test_points_of_a_gltf_have_y_up_too(tmp_path):
+    heights = uneven(19, 23)
+    points = points_of(heights, CELL)[:, [0, 2, 1]] * [1, 1, -1]
+    (tmp_path / "site.glb").write_bytes(trimesh.Scene(trimesh.PointCloud(points)).export(file_type="glb"))
+    np.testing.assert_allclose(read(tmp_path / "site.glb").heights, heights, rtol=0, atol=1e-6)
+
+
+def test_a_mesh_lies_where_its_scene_puts_it(tmp_path):
+    scene, move = trimesh.Scene(), np.eye(4)
+    move[:3, 3] = 100, 2, 50  # east, up, south
+    scene.add_geometry(trimesh.creation.box((10, 1, 10)), transform=move)
+    (tmp_path / "site.glb").write_bytes(scene.export(file_type="glb"))
+    raster = read(tmp_path / "site.glb")
+    assert raster.origin == (95, -55)
+    np.testing.assert_allclose(raster.heights, np.full((161, 161), 2.5), rtol=0, atol=1e-6)
+
+
+def test_an_stl_in_text_is_read(tmp_path):
+    heights = uneven(19, 23)
+    points = points_of(heights, CELL)
+    mesh = trimesh.Trimesh(points, triangles_of(points), process=False)
+    (tmp_path / "site.stl").write_text(mesh.export(file_type="stl_ascii"))
+    np.testing.assert_allclose(read(tmp_path / "site.stl").heights, heights, rtol=0, atol=1e-6)
 
 
 def test_up_is_as_the_format_says_unless_it_is_given(tmp_path):

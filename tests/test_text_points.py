@@ -89,6 +89,7 @@ def test_text_is_read_however_it_is_spelled(tmp_path, spelling, suffix):
         "x,y,z_mm\n1,2,3\n": "column 'z_mm': has heights in units of 0.001 m (mm); give that (--height-scale=0.001)",
         "x,y,z_ground,z_canopy\n1,2,3,4\n": "columns 'z_ground' and 'z_canopy': all name z: must be one",
         "Point Number X Y Z Code\n7 1 2 3 4\n": "header: names 6 columns, the first row has 5: must name each",
+        '"x" "y" "z"\n"7" 0 0 1\n"9" 1 0 2\n': "header: names 3 columns, the first row has 4: must name each",
         "a b c\n1 2 3\n": "header = 'a,b,c': must name x, y, z",
         " ".join("1" * 30) + "\n": "columns = 30: is a matrix of heights, or has many columns and no header",
         "1 2 3 4\n1 2\n": "cannot be read as a table of x, y, z: ",

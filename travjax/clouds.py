@@ -3,6 +3,7 @@
 x is east, y is north, z is up, whatever the order of the points; where y points up, z points south.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,10 +97,10 @@ def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:
     if options.classes is not None:
         raise InputError(f"classes = {options.classes}: must be left out: a mesh has none")
     mesh = read_mesh(path)
+    up = options.up or mesh.up
     if not len(mesh.faces):
         points = Points(*mesh.vertices.T)._replace(notes=("it has no triangles: its points are taken",))
-        return _of_points(points, options, grid)
-    up = options.up or mesh.up
+        return _of_points(points, replace(options, up=up), grid)
     x, y, z, known = _in_metres(Points(*mesh.vertices[mesh.faces].reshape(-1, 3).T), up, options)
     corners = np.stack([x, y, z], axis=1).reshape(-1, 3, 3)[known.reshape(-1, 3).all(axis=1)]
     x, y, z = corners.reshape(-1, 3).T

@@ -229,7 +229,8 @@ def _columns(fields: list[str], columns: int, options: DemOptions) -> dict[str, 
         raise InputError(
             f"header = {shown[:60]!r}: must name x, y, z (or easting, northing, elevation), or be left out"
         )
-    if len(fields) != columns and {found["x"], found["y"], found["z"]} != {0, 1, 2}:
+    first = {found["x"], found["y"], found["z"]} == {0, 1, 2}
+    if len(fields) != columns and (not first or columns == len(fields) + 1):  # one more may be the names of rows
         raise InputError(f"header: names {len(fields)} columns, the first row has {columns}: must name each")
     for axis in "xyz":
         field = fields[found[axis]]  # type: ignore[index]
