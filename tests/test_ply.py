@@ -88,6 +88,14 @@ def test_lists_before_the_vertices_are_passed_over(tmp_path):
             assert raster.notes[0].startswith("2 faces are passed over: its vertices are taken as points")
 
 
+@pytest.mark.parametrize("count", [0, 5, 10**22])
+def test_elements_without_properties_are_passed_over(tmp_path, count):
+    path = ply(tmp_path / "site.ply", f"element nothing {count}\n" + VERTICES)
+    np.testing.assert_array_equal(read(path).heights, HEIGHTS)
+    text = ply(tmp_path / "site.ply", f"element nothing {count}\n" + VERTICES, b"0 0 1\n" * 480, "ascii")
+    assert refusal(text)
+
+
 def test_classes_of_vertices_are_heard(tmp_path):
     table = np.zeros(480, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("c", "<f4")])
     table["x"], table["y"], table["z"] = POINTS.T

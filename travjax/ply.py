@@ -153,7 +153,7 @@ def _pass_over(file: BinaryIO, order: str, element: Element) -> None:
                 raise InputError(f"cannot be read as PLY: {printable(element.name[:40])}: it is cut short")
         return
     start = file.tell()
-    if _table(file, order, element) is not None:
+    if not element.properties or _table(file, order, element) is not None:
         return
     file.seek(start)
     for _ in range(element.count):  # lists of different lengths: slower
