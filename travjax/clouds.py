@@ -1,346 +1,168 @@
-"""Point clouds as rasters: text of x, y, z, PLY, LAS and LAZ (SPEC section 11).
+"""Point clouds and meshes of every format as rasters (SPEC section 11).
 
-x is east, y is north, z is up, whatever the order of the points. Points that stand on a lattice (a raster that was
-written as points) are that raster. Others are averaged in square cells around multiples of the cell size, which keeps
-detail that is finer than a cell from showing as steps; a cell without points is unknown.
+x is east, y is north, z is up, whatever the order of the points; where y points up, z points south.
 """
 
-import re
-from importlib import import_module
+from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from travjax.config import InputError
+from travjax.coordinates import name_of, parsed, require_metric
+from travjax.dem_options import DemOptions
 from travjax.grid import Grid
-from travjax.raster import (
-    COARSEST,
-    Raster,
-    agreed_cell_size,
-    require_heights,
-    require_size,
-)
+from travjax.gridding import gridded, require_fits
+from travjax.las import read_las
+from travjax.meshes import read_mesh, surface
+from travjax.pcd import read_pcd
+from travjax.ply import read_ply
+from travjax.points import Points, ground_of, listed, require_fine_steps, whole_classes
+from travjax.raster import Raster, require_heights, require_size
+from travjax.text_points import read_text
 
-TEXT = (".xyz", ".txt", ".csv", ".pts")
-SUFFIXES = (*TEXT, ".ply", ".las", ".laz")
+SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".ply", ".las", ".laz", ".pcd", ".obj", ".stl", ".gltf", ".glb")
+"""Usual suffixes of these files."""
 
-NAMES = {
-    "x": ("x", "east", "easting"),
-    "y": ("y", "north", "northing"),
-    "z": ("z", "elevation", "height", "altitude"),
-    "degrees": ("lat", "latitude", "lon", "long", "longitude"),
-}
-"""What the header of a text may call its columns."""
-
-NOISE = (7, 18)
-"""Classes of LAS points that are no ground: low and high noise."""
-
-TRIANGLES = {"face": {"vertex_indices": 3, "vertex_index": 3}}
-"""Lists of a PLY file that are passed over at once if they are as long as that."""
-
-POINTS_A_CELL = 2
-"""On average; at this density an eighth of the cells has none, and those are small holes."""
-
-LARGEST = 2**28
-"""Cells: a square kilometre at 0.0625 m, 2 GiB."""
-
-CHUNK = 2_000_000
-"""Points of a LAS file in memory with all that they hold."""
+Y_UP = "its points lie flat along x and z: if y points up, say so (--up=y)"
 
 
-class Points(NamedTuple):
-    """x, y and z [n], as the file stores them, and the coordinate system of rasterio, or None."""
+def read_cloud(path: Path, form: str, options: DemOptions, grid: Grid) -> Raster:
+    """Returns the points or the mesh of a file as a raster.
 
-    x: np.ndarray
-    y: np.ndarray
-    z: np.ndarray
-    crs: Any = None
-
-
-def read_cloud(path: Path, form: str, options, grid: Grid) -> Raster:
-    """The points of a file as a raster; cell_size, scale (height_scale) and nodata as `load_dem` takes them.
-
-    Points whose z is NaN or nodata are left out. Raises InputError when the file cannot be read or is cut short, its
-    coordinates are not finite, in degrees or feet, or in too large steps, and when the points are too few, or too far
-    apart for a raster.
+    form: "text", "ply" (its vertices), "pcd", "las" (LAS and LAZ), or "mesh" (OBJ, STL, glTF and GLB), whose surface
+          as seen from above is taken
+    Points whose height is NaN or nodata are left out. Raises InputError when the file cannot be read or is cut short,
+    its coordinates are not finite, in degrees or feet, or in too large steps, and when the points are too few, or too
+    far apart for a raster.
     """
-    cell_size, scale, nodata = options.cell_size, options.height_scale, options.nodata
-    read = {"text": _read_text, "ply": _read_ply, "las": _read_las}[form]
-    x, y, z, crs = read(path)
-    _require_fine_steps(x, y)
-    z = z.astype(np.float64)
-    known = ~np.isnan(z)
-    if nodata is not None:
-        known &= ~np.isclose(z, nodata, rtol=1e-6, atol=1e-6)
-    x, y, z = x[known].astype(np.float64), y[known].astype(np.float64), z[known] * (scale or 1.0)
-    require_heights(z)
-    _require_metres(x, y, grid)
-    raster = _lattice(x, y, z)
-    if raster is None:
-        raster = _averaged(x, y, z, cell_size or _cell_size(x, y, grid.spacing))
+    match form:
+        case "text":
+            return _of_points(read_text(path, options), options, grid)
+        case "las":
+            return _of_points(read_las(path, options), options, grid)
+        case "ply":
+            return _of_points(read_ply(path), options, grid)
+        case "pcd":
+            return _of_points(read_pcd(path), options, grid)
+    return _of_mesh(path, options, grid)
+
+
+def cloud_of_arrays(arrays: dict[str, np.ndarray], options: DemOptions, grid: Grid) -> Raster:
+    """Returns the points in the arrays of an .npz file as a raster.
+
+    arrays: `x`, `y` and `z` [n], or `points` [n, 3], and if they are there, `classification` [n] and `crs`
+    Raises InputError when they are none of these, and as `read_cloud` does.
+    """
+    if "points" in arrays:
+        points = arrays["points"]
+        if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "iuf":
+            raise InputError(f"points: {points.dtype} {list(points.shape)}: must be numbers [n, 3]")
+        x, y, z = points.T
+    elif {"x", "y", "z"} <= set(arrays):
+        x, y, z = (arrays[axis] for axis in "xyz")
     else:
-        agreed_cell_size(raster.cell_size, cell_size)
-    fewest = int(grid.size / max(raster.cell_size, COARSEST)) ** 2
-    if len(z) < fewest:
-        raise InputError(f"points = {len(z)}: must be at least {fewest}, as many as a window has cells")
-    return Raster(raster.heights, raster.cell_size, raster.origin, None)
+        raise InputError(f"no array `points`, nor x, y, z; it holds: {listed(arrays)}")
+    classes = arrays.get("classification")
+    given = {"x": x, "y": y, "z": z} | ({} if classes is None else {"classification": classes})
+    for name, values in given.items():
+        if values.ndim != 1 or len(values) != len(x) or values.dtype.kind not in "iuf":
+            raise InputError(f"{name}: {values.dtype} {list(values.shape)}: must be numbers [n], as many as x")
+    whole = whole_classes(classes)
+    if whole is None and classes is not None:
+        raise InputError("classification: must be whole numbers from 0 to 255")
+    named = str(np.ravel(arrays["crs"])[0]) if np.size(arrays.get("crs", ())) else ""
+    crs = parsed(named) if named else None
+    return _of_points(Points(x, y, z, crs, whole), options, grid)
 
 
-def _require_fine_steps(x: np.ndarray, y: np.ndarray) -> None:
-    """Refuses coordinates too large for the float32 that they are stored as."""
-    for name, values in (("x", x), ("y", y)):
-        if values.dtype == np.float32:
-            largest = np.nanmax(np.abs(values), initial=0)
-            if np.isfinite(largest) and np.spacing(largest) > 0.01:
-                raise InputError(
-                    f"{name} = {largest:g}: is stored in steps of {np.spacing(largest):g} m (float32): must be double, "
-                    "or relative to a place nearby"
-                )
+def _of_points(points: Points, options: DemOptions, grid: Grid) -> Raster:
+    points = ground_of(points, options.classes)
+    x, y, z, known = _in_metres(points, options.up, options)
+    x, y, z = x[known], y[known], z[known]
+    _require_site(x, y, z, grid)
+    require_metric(points.crs, float(np.median(x)), float(np.median(y)), options.height_scale is not None)
+    notes = points.notes
+    if options.up is None and _lies_along_z(x, y, z):
+        notes += (Y_UP,)
+    try:
+        raster = gridded(x, y, z, options.cell_size, grid)
+    except InputError as error:
+        raise InputError("; ".join([str(error), *notes])) from None
+    return Raster(raster.heights, raster.cell_size, raster.origin, name_of(points.crs), notes + raster.notes)
 
 
-def _require_metres(x: np.ndarray, y: np.ndarray, grid: Grid) -> None:
-    """Refuses coordinates that are not finite or look like degrees, and sites smaller than a window."""
+def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:
+    """The highest surface above nodes at the grid's spacing, or at the cell size given, from the mesh's own corner."""
+    if options.classes is not None:
+        raise InputError(f"classes = {options.classes}: must be left out: a mesh has none")
+    mesh = read_mesh(path)
+    up = options.up or mesh.up
+    if not len(mesh.faces):
+        points = Points(*mesh.vertices.T)._replace(notes=("it has no triangles: its points are taken",))
+        return _of_points(points, replace(options, up=up), grid)
+    x, y, z, known = _in_metres(Points(*mesh.vertices[mesh.faces].reshape(-1, 3).T), up, options)
+    corners = np.stack([x, y, z], axis=1).reshape(-1, 3, 3)[known.reshape(-1, 3).all(axis=1)]
+    x, y, z = corners.reshape(-1, 3).T
+    _require_site(x, y, z, grid)
+    flat = up is None and _lies_along_z(x, y, z)
+    east, north, cell_size = float(np.ptp(x)), float(np.ptp(y)), options.cell_size or grid.spacing
+    try:
+        require_size(east, north, grid)
+        require_fits(east, north, cell_size, grid.spacing)
+    except InputError as error:
+        raise InputError(f"{error}; {Y_UP}" if flat else str(error)) from None
+    shape = int(north / cell_size + 1e-6) + 1, int(east / cell_size + 1e-6) + 1
+    raster = surface(corners, cell_size, shape)
+    notes = (f"{len(corners)} triangles are taken as they are seen from above", *((Y_UP,) if flat else ()))
+    return Raster(raster.heights, raster.cell_size, raster.origin, notes=notes)
+
+
+def _in_metres(points: Points, up: str | None, options: DemOptions) -> tuple[np.ndarray, ...]:
+    """x to the east, y to the north and z up [n] in float64, and which have a height; refuses too large steps."""
+    east, north, height = (points.x, points.z, points.y) if up == "y" else (points.x, points.y, points.z)
+    z = height.astype(np.float64)
+    known = ~np.isnan(z)
+    if options.nodata is not None:
+        known &= ~np.isclose(z, options.nodata, rtol=1e-6, atol=1e-6)
+    scale = options.height_scale or 1.0
+    for name, values in zip("xyz", points[:3], strict=True):
+        require_fine_steps(name, values[known], scale if values is height else 1.0)
+    y = north.astype(np.float64)
+    return east.astype(np.float64), -y if up == "y" else y, z * scale, known
+
+
+def _require_site(x: np.ndarray, y: np.ndarray, z: np.ndarray, grid: Grid) -> None:
+    """Refuses heights that are none, and coordinates that are not finite or look like degrees."""
+    require_heights(z)
     for name, values in (("x", x), ("y", y)):
         near = np.abs(values) < 1e9
         if not near.all():
             raise InputError(f"{name} = {values[~near][0]:g}: must be finite, below 1e9 m")
-    east, north = np.ptp(x), np.ptp(y)
-    if max(east, north) < grid.size / 10 and np.abs(x).max() <= 180 and np.abs(y).max() <= 90:
+    east, north = (float(np.subtract(*np.quantile(values, (0.95, 0.05)))) for values in (x, y))
+    middle = float(np.median(x)), float(np.median(y))
+    if max(east, north) < grid.size / 10 and abs(middle[0]) <= 180 and abs(middle[1]) <= 90:
         raise InputError(
-            f"x, y = {x[0]:.6g}, {y[0]:.6g} within {east:.3g} x {north:.3g}: look like degrees; must be metres "
-            "(reproject to a UTM zone, say)"
+            f"x, y = {middle[0]:.6g}, {middle[1]:.6g} within {east:.3g} x {north:.3g}: look like degrees; must be "
+            "metres (reproject to a UTM zone, say)"
         )
-    require_size(east, north, grid)
 
 
-def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Raster | None:
-    """The raster that the points are, if most of them have a neighbour one step east and none has a double."""
-    axes = [_regular(values) for values in (x, y)]
-    (west, across, cols), (south, along, rows) = axes
-    if not cols * rows or cols * rows > LARGEST or abs(across - along) > 1e-3 * across:
-        return None
-    place = np.rint((y - south) / along).astype(np.int64) * cols + np.rint((x - west) / across).astype(np.int64)
-    taken = np.zeros((rows, cols), bool)
-    taken.ravel()[place] = True
-    neighbours = np.count_nonzero(taken[:, 1:] & taken[:, :-1])
-    if np.count_nonzero(taken) < len(z) or neighbours < len(z) / 2:
-        return None
-    heights = np.full((rows, cols), np.nan)
-    heights.ravel()[place] = z
-    return Raster(heights, float(across), (float(west), float(south)))
-
-
-def _regular(values: np.ndarray) -> tuple[float, float, int]:
-    """(least, step, number of levels) of values on a regular scale but for rounding; 0 levels of others.
-
-    Of the steps that the rounding leaves room for, the one with the fewest digits.
-    """
-    levels = np.unique(values)
-    gaps = np.diff(levels)
-    wide = gaps[gaps > 1e-4]  # metres; what is nearer is the same level with another rounding
-    if not wide.size:
-        return levels[0], 0.0, 0
-    number = np.concatenate([[0], np.cumsum(np.round(gaps / wide.min()))])
-    step = (levels[-1] - levels[0]) / number[-1]
-    away = np.abs(levels - levels[0] - step * number).max()
-    doubt = 2 * away / number[-1] + 1e-12
-    step = next(shorter for digits in range(16) if abs((shorter := round(float(step), digits)) - step) <= doubt)
-    return levels[0], step, int(number[-1]) + 1 if away < 0.1 * step else 0
-
-
-def _cell_size(x: np.ndarray, y: np.ndarray, finest: float) -> float:
-    """Metres, whole millimetres above `finest`: cells that hold POINTS_A_CELL at the site's usual density.
-
-    That is the median of blocks that would hold 16 points each if these were spread evenly. A twentieth of the points
-    on each side does not count, so that a few astray have no say.
-    """
-    ends = [np.quantile(values, (0.05, 0.95)) for values in (x, y)]
-    area = np.prod([high - low for low, high in ends])
-    if not area:
-        return finest
-    inner = np.all([(low <= values) & (values <= high) for values, (low, high) in zip((x, y), ends, strict=True)], 0)
-    edge = 4 * np.sqrt(area / np.count_nonzero(inner))
-    (col, _), (row, _) = (_cells(values[inner], edge) for values in (x, y))
-    held = np.bincount(row * (col.max() + 1) + col)
-    cell = edge * np.sqrt(POINTS_A_CELL / np.median(held[held > 0]))
-    return max(finest, float(np.ceil(1000 * cell) / 1000))
-
-
-def _cells(values: np.ndarray, edge: float) -> tuple[np.ndarray, int]:
-    """(number of the cell that each value lies in [n], number of the first): cells around the multiples of the edge."""
-    number = np.floor(values / edge + 0.5).astype(np.int64)
-    first = int(number.min())
-    return number - first, first
-
-
-def _averaged(x: np.ndarray, y: np.ndarray, z: np.ndarray, cell_size: float) -> Raster:
-    """The mean height of the points in each cell, NaN where there are none."""
-    east, north = np.ptp(x), np.ptp(y)
-    if (east / cell_size + 2) * (north / cell_size + 2) > LARGEST:
-        raise InputError(
-            f"size = {east:g} x {north:g} m: must be at most {LARGEST} cells of {cell_size:g} m; is a point astray?"
-        )
-    (col, first_col), (row, first_row) = (_cells(values, cell_size) for values in (x, y))
-    rows, cols = int(row.max()) + 1, int(col.max()) + 1
-    place = row * cols + col
-    count = np.bincount(place, minlength=rows * cols)
-    heights = np.bincount(place, weights=z, minlength=rows * cols)
-    heights = np.divide(heights, count, out=np.full(rows * cols, np.nan), where=count > 0)
-    origin = (first_col * cell_size, first_row * cell_size)
-    return Raster(heights.reshape(rows, cols), float(cell_size), origin)
-
-
-def _installed(module: str, package: str = "") -> ModuleType:
-    try:
-        return import_module(module)
-    except ImportError:
-        raise InputError(f"reading it needs {module}: pip install {package or module}") from None
-
-
-# ---- Text
-
-
-def _read_text(path: Path) -> Points:
-    """Columns split by semicolons, commas or blanks; before them a header, the number of points, # and // lines."""
-    try:
-        skipped, stated, header, first = _beginning(path)
-        separator = _separator(first)
-        columns = _columns(header) if header else [0, 1, 2]
-        table = np.loadtxt(path, delimiter=separator, skiprows=skipped, usecols=columns, ndmin=2, encoding="utf-8-sig")
-    except InputError:
-        raise
-    except UnicodeDecodeError:
-        raise InputError(f"cannot be read as {path.suffix}: it is no text") from None
-    except ValueError as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"cannot be read as a table of x, y, z: {reason} (rows count from 0)") from None
-    if stated is not None and len(table) != stated:
-        raise InputError(f"points = {len(table)}: must be {stated}, as its first line says; it is cut short")
-    return Points(*table.T)
-
-
-def _beginning(path: Path) -> tuple[int, int | None, str, str]:
-    """(lines before the first of numbers, number of points that a line states or None, header or "", that line)."""
-    stated, header = None, ""
-    with path.open(encoding="utf-8-sig") as file:
-        for number, line in enumerate(file):
-            text = line.strip()
-            fields = _fields(text.lstrip("#/"))
-            if text.startswith(("#", "//")):
-                header = text.lstrip("#/ ") if _is_header(fields) else header
-            elif len(fields) == 1 and fields[0].isdigit():
-                stated = int(fields[0])
-            elif sum(map(_is_number, fields)) >= 3:
-                return number, stated, header, text
-            elif text:
-                header = text
-    raise InputError(f"cannot be read as {path.suffix}: no line of it holds three numbers")
-
-
-def _separator(line: str) -> str | None:
-    return next((mark for mark in (";", ",") if mark in line), None)
-
-
-def _fields(line: str) -> list[str]:
-    """The columns of a line, without the unit that a name may carry, quotes and case."""
-    fields = line.strip().split(_separator(line))
-    return [re.sub(r"[\[(].*", "", field).strip(" \"'").lower() for field in fields] or [""]
-
-
-def _is_number(field: str) -> bool:
-    try:
-        float(field)
-    except ValueError:
+def _lies_along_z(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> bool:
+    """Whether points lie on a surface over x and z rather than over x and y, as where y points up."""
+    some = slice(None, None, max(1, len(x) // 20_000))
+    x, y, z = x[some], y[some], z[some]
+    across, along, high = (float(np.subtract(*np.quantile(values, (0.99, 0.01)))) for values in (x, y, z))
+    if along > 0.7 * min(across, high):
         return False
-    return True
+    edge = max(across, high) / 32
+    return _spread(x, y, z, edge) > 3 * _spread(x, z, y, edge)
 
 
-def _is_header(fields: list[str]) -> bool:
-    """Whether these are the names of at least x, y and z."""
-    return all(any(field in NAMES[axis] for field in fields) for axis in "xyz")
-
-
-def _columns(header: str) -> list[int]:
-    """Where x, y and z stand."""
-    fields = _fields(header)
-    degrees = [field for field in fields if field in NAMES["degrees"]]
-    if degrees:
-        raise InputError(f"column {degrees[0]!r}: is in degrees; reproject it to metres (a UTM zone, say) first")
-    if not _is_header(fields):
-        raise InputError(
-            f"header = {header[:60]!r}: must name x, y, z (or easting, northing, elevation), or be left out"
-        )
-    return [next(i for i, field in enumerate(fields) if field in NAMES[axis]) for axis in "xyz"]
-
-
-# ---- PLY and LAS
-
-
-def _read_ply(path: Path) -> Points:
-    """The vertices; faces are passed over."""
-    plyfile = _installed("plyfile")
-    try:
-        try:
-            data = plyfile.PlyData.read(path, known_list_len=TRIANGLES)
-        except plyfile.PlyElementParseError:
-            data = plyfile.PlyData.read(path)  # lists of other lengths: slower
-    except (plyfile.PlyParseError, ValueError, EOFError) as error:
-        raise InputError(f"cannot be read as .ply: {str(error).splitlines()[0]}") from None
-    if "vertex" not in data:
-        raise InputError(f"no element `vertex`; it holds: {', '.join(element.name for element in data) or 'nothing'}")
-    vertices = data["vertex"].data
-    names = [name for name in vertices.dtype.names or () if vertices.dtype[name].kind in "iuf"]
-    if not {"x", "y", "z"} <= set(names):
-        raise InputError(f"vertex: must have numbers x, y, z; it has: {', '.join(names) or 'none'}")
-    return Points(*(np.asarray(vertices[axis]) for axis in "xyz"))
-
-
-def _read_las(path: Path) -> Points:
-    """All points but noise and those withheld, a chunk at a time."""
-    laspy = _installed("laspy", "'laspy[lazrs]'")
-    if path.suffix.lower() == ".laz":
-        _installed("lazrs")
-    try:
-        with laspy.open(path) as file:
-            crs, stated, read, parts = _las_crs(file.header), file.header.point_count, 0, [np.zeros((3, 0))]
-            for points in file.chunk_iterator(CHUNK):
-                read += len(points)
-                kept = ~np.isin(np.asarray(points.classification), NOISE) & (np.asarray(points.withheld) == 0)
-                parts.append(np.stack([np.asarray(points[axis])[kept] for axis in "xyz"]))
-    except InputError:
-        raise
-    except laspy.LaspyException as error:
-        raise InputError(f"cannot be read as {path.suffix}: {str(error).splitlines()[0]}") from None
-    except (ValueError, RuntimeError):  # of lazrs, or of a last record in part
-        raise InputError(f"cannot be read as {path.suffix}: it is cut short or damaged") from None
-    if read != stated:
-        raise InputError(f"points = {read}: must be {stated}, as its header says; it is cut short")
-    x, y, z = np.concatenate(parts, axis=1)
-    return Points(x, y, z, crs)
-
-
-def _las_crs(header: Any) -> Any:
-    """The coordinate system of the header: its WKT, else the EPSG code and the units of its GeoTIFF keys, or None."""
-    records = [*header.vlrs, *(header.evlrs or ())]
-    described = [record.string for record in records if type(record).__name__ == "WktCoordinateSystemVlr"]
-    described = [wkt for wkt in described if wkt.strip()]
-    directories = [record.geo_keys for record in records if type(record).__name__ == "GeoKeyDirectoryVlr"]
-    keys = {key.id: key.value_offset for keys in directories for key in keys}
-    if not described and not keys:
-        return None
-    rasterio = _installed("rasterio")
-    code = keys.get(3072, 0) if keys.get(1024) != 2 else keys.get(2048, 0)
-    try:
-        if described:
-            return rasterio.crs.CRS.from_wkt(described[0])
-        if 1024 <= code < 32767:
-            return rasterio.crs.CRS.from_epsg(code)
-    except rasterio.errors.CRSError as error:
-        raise InputError(f"crs: cannot be understood: {str(error).splitlines()[0]}") from None
-    if keys.get(1024) == 2:
-        raise InputError("crs: is in degrees; reproject it to metres (a UTM zone, say) first")
-    if keys.get(3076, 9001) != 9001:
-        raise InputError(f"crs: is in units of EPSG:{keys[3076]}, no metres; reproject it to metres first")
-    return None
+def _spread(one: np.ndarray, other: np.ndarray, height: np.ndarray, edge: float) -> float:
+    """Standard deviation of the heights in square cells."""
+    cells = np.floor(np.stack([one, other], axis=1) / edge).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
+    held = np.bincount(cell.ravel())
+    mean = np.bincount(cell.ravel(), height) / held
+    return float(np.sqrt(np.mean((height - mean[cell.ravel()]) ** 2)))

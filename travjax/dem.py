@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from travjax.array_files import rasters_of, read_npy, read_npz
-from travjax.clouds import read_cloud
+from travjax.clouds import cloud_of_arrays, read_cloud
 from travjax.config import InputError, require, require_number
 from travjax.dem_options import DemOptions
 from travjax.files import sha256, user_path
@@ -216,10 +216,13 @@ def _all(raster: Raster) -> np.ndarray:
 
 
 def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
+    """The maps of an .npz, or its points."""
     entries, names = read_npz(path)
-    if "heights" not in entries:
-        raise InputError(f"no array `heights`; it holds: {', '.join(names) or 'nothing'}")
-    return rasters_of(entries, options, names)
+    if "heights" in entries:
+        return rasters_of(entries, options, names)
+    if "points" in entries or {"x", "y", "z"} <= set(entries):
+        return [cloud_of_arrays(entries, options, grid)]
+    raise InputError(f"no array `heights`, nor points; it holds: {', '.join(names) or 'nothing'}")
 
 
 def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarray, float]:
