@@ -177,10 +177,9 @@ def test_a_world_makes_the_same_ground_on_a_larger_map(tmp_path, few, command):
 
     def heights(name: str, *more) -> tuple[np.ndarray, str]:
         done = succeeds(tmp_path / name, *words, "--spacing", 0.125, *more)
-        files = {"label": "labels.npz", "terrain": "terrain.npz"}
-        return np.load(done.folder / "heights.npy") if command == "dataset" else done.arrays(files[command])[
-            "heights"
-        ], done.out
+        if command == "dataset":
+            return np.load(done.folder / "heights.npy"), done.out
+        return done.arrays("labels.npz" if command == "label" else "terrain.npz")["heights"], done.out
 
     small, said = heights("small")
     assert "features" not in said

@@ -1,6 +1,7 @@
 """The transfer experiment's runs: what they share, where they begin, what is computed once, and going on."""
 
 import math
+import shutil
 from dataclasses import replace
 
 import field_runs
@@ -160,6 +161,35 @@ def test_features_of_another_data_set_are_computed_anew(frozen, trained, real, t
     assert made.rows(IMAGENET, 0)[-1]["watched"] == frozen[1][IMAGENET][0][-1]["watched"]
     with np.load(place) as file:
         assert str(file["dataset"]) == real.fingerprint
+
+
+@pytest.mark.parametrize("damage", ["missing", "no archive", "half of it", "a folder"])
+def test_a_damaged_file_of_features_counts_as_none(tmp_path, damage):
+    path = tmp_path / "imagenet.npz"
+    np.savez(path, dataset="this", training=np.zeros(3))
+    assert str(transfer._kept_features(path)["dataset"]) == "this"
+    data = path.read_bytes()
+    path.unlink()
+    if damage == "a folder":
+        path.mkdir()
+    elif damage != "missing":
+        path.write_bytes(b"\x93NUMPY" if damage == "no archive" else data[: len(data) // 2])
+    assert transfer._kept_features(path) == {}
+
+
+def test_scores_of_a_finished_run_that_are_damaged_are_one_line(frozen, trained, real, tmp_path):
+    made = frozen[0]
+    copied = tmp_path / "transfer"
+    shutil.copytree(made.folder, copied)
+    again = Transfer(FROZEN, Run.load(trained), trained, real, copied, made.devices)
+    path = again.place_of(SCRATCH, 0) / "metrics.jsonl"
+    scored = [line for line in path.read_text().splitlines() if "watched" in line]
+    for lines in (scored[:-1], [scored[0], scored[0], *scored[2:]], [*scored[:-1], scored[-1].replace("hill", "hell")]):
+        path.write_text("".join(f"{line}\n" for line in lines))
+        with pytest.raises(InputError, match=r"metrics.jsonl: epochs = \[.*: must be 0 to 2, each with scores of "):
+            again.rows(SCRATCH, 0)
+    path.write_bytes("".join(f"{line}\n" for line in scored).encode() + b"\xff\n")
+    assert again.rows(SCRATCH, 0) == made.rows(SCRATCH, 0)
 
 
 def test_without_frozen_trunks_everything_is_trained_and_random_trunks_differ_by_seed(trained, real, tmp_path):

@@ -282,9 +282,9 @@ def load(folder: str | Path) -> Dataset:
 
 def _read_array(path: Path) -> np.ndarray:
     try:
-        with warnings.catch_warnings():
+        with path.open("rb") as file, warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that are not NumPy's own
-            array = np.load(path, allow_pickle=False)
+            array = np.load(file, allow_pickle=False)
     except Exception as error:  # NumPy raises all sorts over what is no array
         reason = str(error).partition(". ")[0] or type(error).__name__
         raise InputError(f"{path}: cannot be read as an array: {reason}") from None

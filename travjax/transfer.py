@@ -202,7 +202,7 @@ class Transfer:
 def _kept_features(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file of features; none where there is no file or it is damaged, since they can be made anew."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return dict(file)
     except Exception:  # NumPy and zipfile raise all sorts over a damaged file
         return {}
