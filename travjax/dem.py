@@ -222,7 +222,7 @@ def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
         return rasters_of(entries, options, names)
     if "points" in entries or {"x", "y", "z"} <= set(entries):
         return [cloud_of_arrays(entries, options, grid)]
-    raise InputError(f"no array `heights`, nor points; it holds: {', '.join(names) or 'nothing'}")
+    raise InputError(f"no array `heights`; it holds: {', '.join(names) or 'nothing'}")
 
 
 def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarray, float]:
