@@ -77,6 +77,7 @@ def test_a_packed_file_that_is_damaged_or_unfolds_to_too_much_is_refused(tmp_pat
         (b"\xef\xbb\xbfx,y,z\n1,2,3\n", "a.csv", "text"),
         ("x y z\n1 2 3\n".encode("utf-16"), "a.txt", "text"),
         (b"ply\nformat ascii 1.0\n", "a.xyz", "ply"),
+        (b"\xef\xbb\xbfply\nformat ascii 1.0\n", "a.ply", "ply"),
         (b"LASF....", "a.laz", "las"),
         (b"LASF....", "a.tif", "las"),
         (b"# .PCD v0.7\nVERSION 0.7\n", "a.txt", "pcd"),

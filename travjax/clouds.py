@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from travjax.config import InputError
-from travjax.coordinates import name_of, parsed, require_metric
+from travjax.coordinates import name_of, require_metric, system_named
 from travjax.dem_options import DemOptions
 from travjax.grid import Grid
 from travjax.gridding import gridded, require_fits
@@ -72,7 +72,7 @@ def cloud_of_arrays(arrays: dict[str, np.ndarray], options: DemOptions, grid: Gr
     if whole is None and classes is not None:
         raise InputError("classification: must be whole numbers from 0 to 255")
     named = str(np.ravel(arrays["crs"])[0]) if np.size(arrays.get("crs", ())) else ""
-    crs = parsed(named) if named else None
+    crs = system_named(named)
     return _of_points(Points(x, y, z, crs, whole), options, grid)
 
 

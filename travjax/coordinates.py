@@ -107,24 +107,26 @@ def require_metric(crs: CRS | None, x: float, y: float, heights_scaled: bool) ->
 
 
 def require_metric_named(name: str | None, x: float, y: float, heights_scaled: bool) -> None:
-    """Raises InputError unless the system of that code or text is as `require_metric` wants it.
+    """Raises InputError unless the system of that code or text is as `require_metric` wants it."""
+    require_metric(system_named(name), x, y, heights_scaled)
 
-    The text of a local system may be of any kind: it says nothing but that it is one.
+
+def system_named(name: str | None) -> CRS | None:
+    """Returns the system of a code or text; None for none, and for a local one whose text says no more than that.
+
+    Raises InputError for other texts that cannot be understood.
     """
-    if name is not None and not (is_local(name) and _is_vague(name)):
-        require_metric(parsed(name), x, y, heights_scaled)
+    try:
+        return parsed(name) if name else None
+    except InputError:
+        if is_local(name):
+            return None
+        raise
 
 
 def is_local(name: str | None) -> bool:
     """Whether a system, as it is named, says nothing about where on earth it lies."""
     return name is None or name.startswith(("LOCAL_CS", "ENGCRS"))
-
-
-def _is_vague(name: str) -> bool:
-    try:
-        return not parsed(name)
-    except InputError:
-        return True
 
 
 def places(name: str, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:

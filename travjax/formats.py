@@ -70,7 +70,7 @@ def form_of(path: Path) -> str:
         head = file.read(BEGINNING)
     suffix = path.suffix.lower()
     for magic, form in MAGIC.items():
-        if head.startswith(magic):
+        if head.removeprefix(b"\xef\xbb\xbf").startswith(magic):
             return form
     if suffix in (".npy", ".npz"):
         return suffix[1:]  # its reader says what is wrong with it
