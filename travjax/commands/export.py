@@ -24,7 +24,8 @@ def add(commands: options.Commands) -> None:
         "export",
         help="write a trained estimator to one file",
         description="Writes the estimator of a training run to one .safetensors file, which `travjax predict "
-        "--checkpoint` takes, and beside it a model card: what it was trained on, and the tables of its evaluation.",
+        "--checkpoint` takes, and beside it a model card: what it was trained on, and the tables of its evaluation. "
+        "Replaces no other file.",
     )
     parser.add_argument("folder", type=user_path, metavar="RUN", help="folder of a training run")
     parser.add_argument("--checkpoint", default="best", metavar="C", help="best or latest (best)")
