@@ -55,7 +55,7 @@ def caught() -> dict[str, campaign.Finding]:
         ("aborts", "the process ended by signal SIGABRT"),
         ("exits", "the process ended by exit code 3"),
         ("takes memory", "MemoryError at faults.py:"),
-        ("warns", "RuntimeWarning: divide by zero"),
+        ("warns", "RuntimeWarning at faults.py:"),
         ("prints", "words on standard error: libtiff: bad"),
         ("says two lines", "a message that is not one line: "),
         ("names no file", "a message that names no file: cannot be read"),

@@ -31,7 +31,7 @@ FAULTS = {
     "aborts": lambda path: os.abort(),
     "exits": lambda path: os._exit(3),
     "takes memory": lambda path: bytearray(4 << 30),
-    "warns": lambda path: warnings.warn("divide by zero", RuntimeWarning, stacklevel=2),
+    "warns": lambda path: warnings.warn("divide by zero", RuntimeWarning, stacklevel=1),
     "prints": lambda path: os.write(2, b"libtiff: bad"),
     "says two lines": lambda path: _raise(InputError(f"{path}: one\ntwo")),
     "names no file": lambda path: _raise(InputError("cannot be read")),

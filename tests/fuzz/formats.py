@@ -60,7 +60,7 @@ def dem(name: str, make: Callable[[Path], object], reseal: Callable[[Path], None
         windows = load_dem(folder / name, 2.0, grid=GRID, **settings)
         maps, origins = windows.heights, windows.origins
         _require(maps.dtype == np.float32 and maps.shape[1:] == GRID.shape and len(maps) > 0, "heights", maps.shape)
-        _require(not np.isinf(maps).any(), "heights", "infinite")
+        _require(not any(np.isinf(one).any() for one in maps), "heights", "infinite")
         _require(origins.shape == (len(maps), 2) and np.isfinite(origins).all(), "origins", origins.shape)
         _require(0 < windows.cell_size < math.inf, "cell_size", windows.cell_size)
         _require(math.isfinite(windows.height_offset), "height_offset", windows.height_offset)

@@ -95,7 +95,9 @@ def judge(form: Format, folder: Path, noise: Path) -> tuple[str, str]:
     if result == REFUSED and str(folder) not in message:
         return FAILED, f"a message that names no file: {message[:200]}"
     if result != FAILED and caught:
-        return FAILED, f"{caught[0].category.__name__}: {str(caught[0].message)[:200]}"
+        first = caught[0]
+        place = f"{Path(first.filename).name}:{first.lineno}"
+        return FAILED, f"{first.category.__name__} at {place}: {str(first.message)[:200]}"
     if result != FAILED and said:
         return FAILED, f"words on standard error: {said}"
     if result != FAILED and taken > SECONDS:
