@@ -62,7 +62,7 @@ def done(place, words, compilation_cache, shared_code) -> tuple[Path, str]:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Trainer, "_step", interrupted)
             code, _, err = run("tiny", *words)
-        assert code == 130 and err.endswith("travjax: interrupted\n")
+        assert code == 130 and err.endswith("travjax: interrupted; the same command goes on from there\n")
         assert not (place / "runs/synthetic/tiny/report.md").exists()
         code, out, err = run("tiny", *words)
     assert code == 0, err
