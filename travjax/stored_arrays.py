@@ -67,6 +67,8 @@ def reading(kind: str) -> Iterator[None]:
             yield
     except InputError:
         raise
+    except MemoryError as error:
+        raise InputError(f"does not fit into memory: {error}") from None
     except Exception as error:
         text = (getattr(error, "strerror", None) or str(error)).strip().partition("\n")[0]
         reason = text if " " in text else f"{type(error).__name__} {text}".strip()
