@@ -19,7 +19,7 @@ from travjax.config import InputError, require, require_number
 from travjax.dem_options import DemOptions
 from travjax.files import sha256, user_path
 from travjax.formats import unfolded
-from travjax.grid import Grid
+from travjax.grid import Grid, require_grid
 from travjax.memory import require_memory
 from travjax.raster import Raster, Survey, require_fine, require_known, require_size, survey
 from travjax.raster_files import read_raster
@@ -135,6 +135,7 @@ def load_dem(
     path = user_path(path)
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
+    require_grid(grid)
     options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)
     with _naming(path):
         rasters = _read(path, options, grid)
