@@ -119,6 +119,7 @@ def main(module: str, seeds: str, work: str) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     formats = importlib.import_module(module).FORMATS
+    logging.getLogger("asyncio").disabled = True  # tells of Orbax's tasks that failed, during cases long after
     folder, noise = Path(work) / f"{os.getpid()}", noise_of(Path(work), os.getpid())
     for line in sys.stdin:
         task = json.loads(line)
