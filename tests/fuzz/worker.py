@@ -37,7 +37,7 @@ class Invalid(Exception):
 class Format:
     """A kind of file.
 
-    make:   writes a valid file, or several, to an empty folder, the same bytes each time
+    make:   writes a valid file, or several, to an empty folder, the same bytes each time if it can
     read:   has them read by the reader under test and raises Invalid unless what comes out is valid
     reseal: makes the checksums within the files right again, so that damage gets past them
     """
@@ -48,7 +48,7 @@ class Format:
 
 
 def damage(formats: dict[str, Format], name: str, seed: int, seeds: Path, place: Path) -> str:
-    """Writes the case of a seed, the same each time, to the folder `place`; returns what was done to which file."""
+    """Writes the case of a seed to the folder `place`; returns what was done to which file."""
     from .mutations import mutated
 
     form, rng = formats[name], np.random.default_rng([zlib.crc32(name.encode()), seed])
