@@ -21,6 +21,13 @@ def _format(over_damage: Callable[[Path], object]) -> Format:
     return Format(lambda folder: (folder / "it").write_bytes(WHOLE), read)
 
 
+class _TwoLines(InputError):
+    """What InputError itself does not let happen."""
+
+    def __str__(self) -> str:
+        return f"{self.args[0]}: one\ntwo"
+
+
 def _raise(error: Exception) -> None:
     raise error
 
@@ -33,7 +40,7 @@ FAULTS = {
     "takes memory": lambda path: bytearray(4 << 30),
     "warns": lambda path: warnings.warn("divide by zero", RuntimeWarning, stacklevel=1),
     "prints": lambda path: os.write(2, b"libtiff: bad"),
-    "says two lines": lambda path: _raise(InputError(f"{path}: one\ntwo")),
+    "says two lines": lambda path: _raise(_TwoLines(path)),
     "names no file": lambda path: _raise(InputError("cannot be read")),
 }
 

@@ -128,7 +128,8 @@ def _number(data: bytes, rng: Rng) -> tuple[bytes, str]:
     size = struct.calcsize(f"<{form}")
     if form in "fd":
         value = REALS[rng.integers(len(REALS))]
-        coded = np.array(value, np.float32 if form == "f" else np.float64).tobytes()
+        with np.errstate(over="ignore"):
+            coded = np.array(value, np.float32 if form == "f" else np.float64).tobytes()
     else:
         value = NUMBERS[rng.integers(len(NUMBERS))]
         coded = (value % 2 ** (8 * size)).to_bytes(size, "little")

@@ -37,7 +37,7 @@ class Invalid(Exception):
 class Format:
     """A kind of file.
 
-    make:   writes a valid file, or several, to an empty folder, the same bytes each time
+    make:   writes a valid file, or several, to an empty folder, the same bytes each time if it can
     read:   has them read by the reader under test and raises Invalid unless what comes out is valid
     reseal: makes the checksums within the files right again, so that damage gets past them
     """
@@ -48,7 +48,7 @@ class Format:
 
 
 def damage(formats: dict[str, Format], name: str, seed: int, seeds: Path, place: Path) -> str:
-    """Writes the case of a seed, the same each time, to the folder `place`; returns what was done to which file."""
+    """Writes the case of a seed to the folder `place`; returns what was done to which file."""
     from .mutations import mutated
 
     form, rng = formats[name], np.random.default_rng([zlib.crc32(name.encode()), seed])
@@ -119,6 +119,7 @@ def main(module: str, seeds: str, work: str) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     formats = importlib.import_module(module).FORMATS
+    logging.getLogger("asyncio").disabled = True  # tells of Orbax's tasks that failed, during cases long after
     folder, noise = Path(work) / f"{os.getpid()}", noise_of(Path(work), os.getpid())
     for line in sys.stdin:
         task = json.loads(line)
