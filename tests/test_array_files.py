@@ -143,6 +143,23 @@ def test_a_member_that_does_not_fit_into_memory_is_said_before_it_is_read(tmp_pa
     assert refusal(tmp_path / "a.npz").startswith("heights.npy: takes 0 MiB of memory: must be at most 0 MiB")
 
 
+def test_a_text_of_numbers_that_are_no_letters_is_one_line(tmp_path):
+    header = b"\x93NUMPY\x01\x00" + (72).to_bytes(2, "little")
+    described = b"{'descr': '<U2', 'fortran_order': False, 'shape': ()}".ljust(71) + b"\n"
+    np.savez(tmp_path / "a.npz", heights=uneven(0, 17, 17), cell_size=0.0625)
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive:
+        archive.writestr("crs.npy", header + described + b"\xff" * 8)
+    assert refusal(tmp_path / "a.npz") == "crs.npy: holds numbers that are no letters: must be text"
+
+
+def test_a_nan_that_signals_is_unknown_without_a_warning(tmp_path):
+    heights = uneven(0, 17, 17).astype(np.float32)
+    heights.view(np.uint32)[3, 4] = 0x7F800001
+    np.save(tmp_path / "a.npy", heights)
+    windows = load_dem(tmp_path / "a.npy", grid=SMALL, cell_size=0.0625, fill_holes=False)
+    assert np.isnan(windows.heights).sum() == 1
+
+
 def test_a_npy_of_another_name_and_an_npz_called_npy_are_read(tmp_path):
     np.save(tmp_path / "a.npy", uneven(0, 17, 17))
     (tmp_path / "a.npy").rename(tmp_path / "a.dat")

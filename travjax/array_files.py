@@ -6,6 +6,7 @@ wrote comes back as it was.
 """
 
 import math
+import sys
 import tokenize
 import zipfile
 from collections.abc import Iterator
@@ -141,7 +142,12 @@ def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     with archive.open(described) as file:
         _require_whole(file, name, described.file_size)
     with archive.open(described) as file:
-        return np.lib.format.read_array(file, allow_pickle=False)
+        array = np.lib.format.read_array(file, allow_pickle=False)
+    if array.dtype.kind == "U":
+        letters = np.atleast_1d(array).view(f"{array.dtype.byteorder}u4")
+        if letters.size and letters.max() > sys.maxunicode:
+            raise InputError(f"{name}: holds numbers that are no letters: must be text")
+    return array
 
 
 def _require_whole(file: IO[bytes], name: str, size: int) -> int:

@@ -246,8 +246,13 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
         sharding = getattr(leaves.get(name), "sharding", None)
         blank = np.broadcast_to(np.zeros((), jax.numpy.dtype(dtype)), shape)
         abstract[name] = blank if sharding is None else jax.ShapeDtypeStruct(shape, blank.dtype, sharding=sharding)
-    with _quiet_orbax() as ocp:
-        arrays = ocp.load(path / "state", abstract)
+    try:
+        with _quiet_orbax() as ocp:
+            arrays = ocp.load(path / "state", abstract)
+    except MemoryError:
+        raise
+    except Exception as error:  # Orbax and TensorStore raise whatever their parsers do; the checksums were in order
+        raise InputError(f"{path}: state: cannot be read: {_reason(error)}") from None
     if template is None:
         return unflatten_dict(arrays, sep="/")
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in leaves])

@@ -121,15 +121,17 @@ def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:
 def _in_metres(points: Points, up: str | None, options: DemOptions) -> tuple[np.ndarray, ...]:
     """x to the east, y to the north and z up [n] in float64, and which have a height; refuses too large steps."""
     east, north, height = (points.x, points.z, points.y) if up == "y" else (points.x, points.y, points.z)
-    z = height.astype(np.float64)
+    scale = options.height_scale or 1.0
+    with np.errstate(invalid="ignore"):  # of a NaN that signals, in damaged files
+        z = height.astype(np.float64)
+        metres = z * scale
     known = ~np.isnan(z)
     if options.nodata is not None:
         known &= ~np.isclose(z, options.nodata, rtol=1e-6, atol=1e-6)
-    scale = options.height_scale or 1.0
     for name, values in zip("xyz", points[:3], strict=True):
         require_fine_steps(name, values[known], scale if values is height else 1.0)
     y = north.astype(np.float64)
-    return east.astype(np.float64), -y if up == "y" else y, z * scale, known
+    return east.astype(np.float64), -y if up == "y" else y, metres, known
 
 
 def _require_site(x: np.ndarray, y: np.ndarray, z: np.ndarray, grid: Grid) -> None:
@@ -156,6 +158,8 @@ def _lies_along_z(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> bool:
     if along > 0.7 * min(across, high):
         return False
     edge = max(across, high) / 32
+    if not edge:
+        return False
     return _spread(x, y, z, edge) > 3 * _spread(x, z, y, edge)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from travjax.config import InputError
 from travjax.dem_options import DemOptions
 from travjax.geokeys import system_of
-from travjax.laz import require_decompressible
+from travjax.laz import require_decompressible, without_panics
 from travjax.points import COARSEST_STEP, Points, installed, reason_of
 
 CHUNK = 2_000_000
@@ -55,7 +55,7 @@ def read_las(path: Path, options: DemOptions) -> Points:
     parts, read = [(np.zeros((3, 0)), np.zeros(0, np.uint8))], 0
     form = "LAZ" if header.compressed else "LAS"
     try:
-        with laspy.open(path, read_evlrs=False) as points:
+        with without_panics(), laspy.open(path, read_evlrs=False) as points:
             for chunk in points.chunk_iterator(CHUNK) if header.points else ():
                 read += len(chunk)
                 parts.append(_kept(chunk))

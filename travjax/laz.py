@@ -4,7 +4,11 @@ It believes every count and aborts the process where it cannot have the memory; 
 and layout are those of the LASzip specification.
 """
 
+import os
 import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import BinaryIO
 
 from travjax.config import InputError
@@ -26,6 +30,21 @@ MOST_POINTS = 2**22
 POINTWISE_CHUNKED, LAYERED = 2, 3
 VARIABLE = 2**32 - 1
 """Points of a chunk that says itself how many it has."""
+
+
+@contextmanager
+def without_panics() -> Iterator[None]:
+    """Drops what is written to standard error meanwhile: Rust tells there of a panic, which is an exception as well."""
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nothing:
+        os.dup2(nothing.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def require_decompressible(

@@ -88,7 +88,8 @@ class InMetres:
 
     def __getitem__(self, part: tuple[slice, slice]) -> np.ndarray:
         values = self._values[part]
-        heights = values.astype(np.float64)
+        with np.errstate(invalid="ignore"):  # of a NaN that signals, in damaged files
+            heights = values.astype(np.float64)
         if self._scale != 1:
             heights *= self._scale
         if self._offset:

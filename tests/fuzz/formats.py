@@ -3,6 +3,7 @@
 A new kind of file is one entry of FORMATS, a worker.Format; `dem` and `cloud` make those of elevation maps.
 """
 
+import gzip
 import hashlib
 import json
 import math
@@ -16,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 from field_runs import RUN
-from points import CLOUDS, points_of, write_las, write_ply, write_text
+from points import CLOUDS, MESHES, points_of, write_las, write_ply, write_text
 from test_imagenet import NARROW, canonical_arrays, keras_arrays, torchvision_arrays, write
 
 from travjax.actions import ActionSpace
@@ -113,6 +114,23 @@ def _png(path: Path) -> None:
     Image.fromarray(((heights(holes=False)[::-1] - 99) * 1000).astype(np.uint16)).save(path)
 
 
+def _pgm(path: Path) -> None:
+    values = (heights(holes=False)[::-1] - 99) * 1000
+    path.write_bytes(b"P5\n35 34\n65535\n" + values.astype(">u2").tobytes())
+
+
+def _lattice(path: Path) -> None:
+    write_text(path, points_of(heights(), CELL, 500.0, 900.0))
+
+
+def _packed(path: Path, make: Callable[[Path], object]) -> None:
+    """The file of `make` in gzip."""
+    inner = path.with_suffix("")
+    make(inner)
+    path.write_bytes(gzip.compress(inner.read_bytes(), mtime=0))
+    inner.unlink()
+
+
 def _png_checksums(path: Path) -> None:
     data, place, pieces = path.read_bytes(), 8, []
     while place + 12 <= len(data):
@@ -162,7 +180,10 @@ ELEVATION = {
     "netCDF": dem("site.nc", _netcdf),
     "ASCII grid": dem("site.asc", _ascii_grid),
     "PNG": dem("site.png", _png, _png_checksums, cell_size=CELL, height_scale=0.001),
-    **{name: cloud(*entry) for name, entry in CLOUDS.items()},
+    "PGM": dem("site.pgm", _pgm, cell_size=CELL, height_scale=0.001),
+    "GeoTIFF in gzip": dem("site.tif.gz", lambda path: _packed(path, _geotiff)),
+    "XYZ in gzip": dem("site.xyz.gz", lambda path: _packed(path, _lattice)),
+    **{name: cloud(*entry) for name, entry in (CLOUDS | MESHES).items()},
     "CSV, scattered": cloud("site.csv", lambda path, points: write_text(path, points, ",", "x,y,z"), off=0.1),
     "PLY, scattered": cloud("site.ply", write_ply, off=0.1),
     "LAS, scattered": cloud("site.las", write_las, off=0.1),
