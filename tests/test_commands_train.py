@@ -74,6 +74,7 @@ def program(words: tuple, *, script: str | None = None, devices: int = 1) -> sub
     """A command in a process of its own."""
     start = ["-c", script] if script else ["-m", "travjax"]
     environment = os.environ | {
+        "TF_CPP_MIN_LOG_LEVEL": "3",  # JAX has set it to 1 in the tests' own process
         "JAX_PLATFORMS": "cpu",
         "XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}",
         "PYTHONWARNINGS": "error",
