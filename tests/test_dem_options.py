@@ -15,7 +15,7 @@ from travjax.dem_options import DemOptions
         ({"height_scale": math.inf}, "height_scale = inf: must be metres, above 0"),
         ({"nodata": math.inf}, "nodata = inf: must be a number: finite, or nan"),
         ({"nodata": "none"}, "nodata = 'none': must be a number"),
-        ({"band": 0}, "band = 0: must be a number from 1, or a name"),
+        ({"band": 0}, "band = 0: must be a number from 1 to 65535, or a name"),
         ({"band": True}, "band = True: must be"),
         ({"band": ""}, "band = '': must be"),
         ({"classes": ()}, "classes = (): must be codes from 0 to 255"),

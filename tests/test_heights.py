@@ -92,7 +92,7 @@ def test_a_mark_in_the_estimators_map_is_refused():
 
 
 def test_heights_of_a_jax_array_are_not_looked_at(function, ground):
-    """What is infinite or beyond 30 km is unknown; a mark within 30 km is ground."""
+    """What is infinite, beyond 30 km or a usual mark is unknown."""
     given = jnp.asarray(ground - 2000, jnp.float32)
     wild = jnp.where(jnp.isnan(given), jnp.asarray([jnp.inf, -1e9])[jnp.arange(GRID.nodes) % 2], given)
     equal(function(wild), function(given))
@@ -101,6 +101,25 @@ def test_heights_of_a_jax_array_are_not_looked_at(function, ground):
 def test_what_is_infinite_in_a_jax_array_is_unknown_to_the_estimator(maps):
     heights = maps["holes"]
     np.testing.assert_array_equal(predict(jnp.asarray(np.nan_to_num(heights, nan=np.inf))), predict(heights))
+
+
+@pytest.mark.parametrize("mark", MARKERS)
+@pytest.mark.parametrize("kind", ["float32", "int32", "float64"])
+def test_a_mark_in_a_jax_array_is_unknown(function, mark, kind):
+    heights = np.random.default_rng(1).integers(-1, 2, GRID.shape).astype(float)
+    heights[3:5, 4] = np.nan
+    with jax.enable_x64(True):
+        equal(function(jnp.asarray(np.nan_to_num(heights, nan=mark), jnp.dtype(kind))), function(heights))
+
+
+@pytest.mark.parametrize(
+    ("kind", "height", "step"), [("f2", 2000, "1 m"), (">f2", 100, "0.0625 m"), (jnp.bfloat16, 9, "0.0625 m")]
+)
+def test_heights_in_coarse_steps_are_refused(function, kind, height, step):
+    given = (np.zeros(GRID.shape) + height).astype(kind)
+    with pytest.raises(InputError, match=f"^heights = {height}: is stored in steps of {step}"):
+        function(given)
+    function((given.astype(np.float64) - height).astype(kind))
 
 
 @pytest.mark.parametrize("height", [0, 2000, 4500])

@@ -39,9 +39,9 @@ class DemOptions:
             object.__setattr__(self, "nodata", None)
         if self.nodata is not None:
             require_number("nodata", self.nodata, -math.inf, math.inf, "a number: finite, or nan")
-        numbered = isinstance(self.band, int) and not isinstance(self.band, bool) and self.band >= 1
+        numbered = isinstance(self.band, int) and not isinstance(self.band, bool) and 1 <= self.band < 2**16
         named = isinstance(self.band, str) and bool(self.band)
-        require(self.band is None or numbered or named, "band", self.band, "a number from 1, or a name")
+        require(self.band is None or numbered or named, "band", self.band, "a number from 1 to 65535, or a name")
         if self.classes is not None:
             codes = isinstance(self.classes, tuple) and all(
                 type(code) is int and 0 <= code < 256 for code in self.classes

@@ -11,6 +11,9 @@ from travjax.arrays import are_numbers, numbers
 from travjax.config import InputError
 from travjax.grid import HIGHEST, MARKERS, Grid, require_grid
 
+COARSEST = 0.05
+"""Metres: heights of a two-byte type in larger steps are refused; bfloat16 has them from 8 m on, float16 from 64 m."""
+
 Heights = Float[Array, "*n rows cols"] | Float[np.ndarray, "*n rows cols"]
 
 
@@ -18,10 +21,10 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     """Returns checked float32 maps with a leading axis, and whether it was one map without that axis.
 
     float64 heights are taken relative to each map's centre before they become float32. Masked and missing nodes are
-    unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or absurd ones are
-    unknown.
+    unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or absurd ones, and
+    those that are a usual mark of unknown ground, are unknown.
     Raises InputError when heights are not numbers in the grid's shape, and when those of any other array are infinite,
-    beyond 30 km or a usual mark of unknown ground (grid.MARKERS).
+    beyond 30 km, a usual mark of unknown ground (grid.MARKERS), or in steps larger than COARSEST.
     """
     require_grid(grid)
     if not isinstance(heights, jax.Array):
@@ -38,12 +41,37 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     maps = heights.reshape(-1, *grid.shape)
     if isinstance(maps, np.ndarray):
         _require_ground(maps)
+        _require_fine(maps)
         if maps.dtype != np.float32:
             maps = _relative(maps.astype(np.float64), grid)
     elif maps.dtype == np.float64:
         with jax.enable_x64(True):
-            maps = _relative(maps, grid).astype(jnp.float32)
+            maps = _relative(_unmarked(maps), grid).astype(jnp.float32)
+    else:
+        maps = _unmarked(maps)
     return jnp.asarray(maps, jnp.float32), heights.ndim == 2
+
+
+def _unmarked(maps: jax.Array) -> jax.Array:
+    """Heights with NaN in place of the usual marks of unknown ground; on the device, nobody waits for it."""
+    marked = maps == MARKERS[0]
+    for mark in MARKERS[1:]:
+        marked |= maps == mark
+    return jnp.where(marked, jnp.nan, maps)
+
+
+def _require_fine(maps: np.ndarray) -> None:
+    """Raises InputError for heights in a number type whose steps are coarse at that height: ground would be flat."""
+    if maps.dtype.kind in "iu" or maps.dtype.itemsize > 2:
+        return
+    values = np.abs(maps.astype(np.float32))
+    largest = np.max(values[values <= HIGHEST], initial=0)
+    step = float(np.exp2(np.floor(np.log2(max(largest, 1e-6)))) * jnp.finfo(maps.dtype).eps)
+    if step > COARSEST:
+        raise InputError(
+            f"heights = {largest:g}: is stored in steps of {step:g} m ({maps.dtype}): must be float32 or float64, or "
+            "relative to a height nearby"
+        )
 
 
 def _require_ground(maps: np.ndarray) -> None:

@@ -46,4 +46,6 @@ def require_disk(size: int, folder: Path, what: str) -> None:
 
 
 def _shown(size: int) -> str:
+    if size < 2**19:
+        return f"{size / 2**10:.0f} KiB"
     return f"{size / 2**30:.1f} GiB" if size >= 2**29 else f"{size / 2**20:.0f} MiB"

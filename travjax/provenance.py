@@ -56,7 +56,8 @@ class Site:
             _require_strip(f"{split}_strip", strip)
             needless = SPLITS.index(self.split) >= SPLITS.index(split)
             require(not (strip and needless), f"{split}_strip", strip, f"left out where split is {self.split}")
-        DemOptions(**{field.name: getattr(self, field.name) for field in fields(DemOptions)})
+        options = DemOptions(**{field.name: getattr(self, field.name) for field in fields(DemOptions)})
+        object.__setattr__(self, "nodata", options.nodata)  # NaN is none
 
     @property
     def group(self) -> str:

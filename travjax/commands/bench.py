@@ -60,7 +60,7 @@ def _write(rows: list[dict], columns: dict[str, str], path: Path) -> None:
     print(f"\n{bench.machine()}\n{report.rows_table(rows, columns)}\n")
     with written_whole(path) as temporary:
         bench.write_tsv(rows, temporary, columns)
-    print(path)
+    progress.wrote(path)
 
 
 def _measure_labelling(arguments: argparse.Namespace, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
@@ -82,4 +82,4 @@ def _measure_labelling(arguments: argparse.Namespace, robot: Robot, actions: Act
     rows = bench.with_speed_up(rows)
     _write(rows, bench.COLUMNS, out / "bench.tsv")
     kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
-    print(plots.save(plots.speed_figure(kernels), out / "bench.png"))
+    progress.wrote(plots.save(plots.speed_figure(kernels), out / "bench.png"))

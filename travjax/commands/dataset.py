@@ -9,7 +9,7 @@ from typing import Any
 from travjax import progress, sites, tfds_builder, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
-from travjax.config import InputError, require
+from travjax.config import InputError, one_line, require
 from travjax.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
 from travjax.dem_options import DemOptions
 from travjax.files import first_lines, output_folder, put_back, require_replaceable, resolved, save_text, user_path
@@ -106,13 +106,13 @@ def run(arguments: argparse.Namespace) -> None:
     dataset = load(folder) if arguments.check else _made(arguments, folder)
     tables = _print_tables(dataset)
     if arguments.check:
-        print(f"{folder}: all files are as they were written")
+        print(one_line(f"{folder}: all files are as they were written"))
     else:
-        print(folder, save_text(statistics, "\n\n".join(tables) + "\n"), sep="\n")
+        progress.wrote(folder, save_text(statistics, "\n\n".join(tables) + "\n"))
     if arguments.tfds:
         with progress.bar("exporting", len(dataset.split), "map") as bar:
             tfds_builder.export(dataset, arguments.tfds, bar.update)
-        print(arguments.tfds)
+        progress.wrote(arguments.tfds)
 
 
 def _are_statistics(path: Path) -> bool:

@@ -198,7 +198,7 @@ def _write_tables(
     if errors is not None:
         results["margin_errors"] = dict(zip(EVENTS, errors.tolist(), strict=True))
     for name, content in (("tables.txt", text), ("evaluation.json", json.dumps(results, indent=1, allow_nan=False))):
-        print(save_text(out / name, content + "\n"))
+        progress.wrote(save_text(out / name, content + "\n"))
 
 
 def _margin_errors(errors: np.ndarray) -> str:
@@ -224,10 +224,10 @@ def _draw(
     from travjax import curves, plots
 
     figure = curves.precision_recall_figure(scores, evaluator.paper, others)
-    print(plots.save(figure, out / "precision_recall.png"))
-    print(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
+    progress.wrote(plots.save(figure, out / "precision_recall.png"))
+    progress.wrote(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
     if maps:
-        print(plots.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
+        progress.wrote(plots.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
 
 
 def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, samples: int) -> "Figure":

@@ -8,6 +8,7 @@ from travjax.commands import options
 from travjax.config import InputError, read_text
 from travjax.files import first_lines, require_replaceable, save_text, user_path
 from travjax.models import FIELD
+from travjax.progress import wrote
 
 if TYPE_CHECKING:
     from travjax.trained import Run
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> None:
     notes = {"dataset": meta["dataset"], "epoch": position["epoch"], "step": position["total"]}
     write_model(arguments.to, trained, network, notes)
     tables, real = (_text(arguments.folder / name) for name in ("evaluation/tables.txt", "comparison/sites.txt"))
-    print(arguments.to, save_text(beside, card(trained, notes, arguments.to.name, tables, real)), sep="\n")
+    wrote(arguments.to, save_text(beside, card(trained, notes, arguments.to.name, tables, real)))
 
 
 def _is_model(path: Path) -> bool:

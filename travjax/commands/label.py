@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax import report, traverse
+from travjax import progress, report, traverse
 from travjax.actions import ActionSpace
 from travjax.commands import options
 from travjax.config import one_line, require
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> None:
         unknown = int((~maps["known"].any(axis=-1)).sum())
         if unknown:
             print(f"{unknown} of {total} maps have no known trajectory; they count in no share.\n")
-        print(labels.path, shares, sep="\n")
+        progress.wrote(labels.path, shares)
         if not arguments.no_figures:
             _write_figures(maps, robot, actions, grid, out)
 
@@ -114,6 +114,8 @@ def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, 
     chosen = samples(maps)
     titles = [title(maps, index) for index in chosen]
     heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
-    print(plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"))
-    print(plots.save(plots.robot_figure(robot), out / "robot.png"))
-    print(plots.save(plots.action_figure(actions, robot, grid), out / "actions.png"))
+    progress.wrote(
+        plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png")
+    )
+    progress.wrote(plots.save(plots.robot_figure(robot), out / "robot.png"))
+    progress.wrote(plots.save(plots.action_figure(actions, robot, grid), out / "actions.png"))

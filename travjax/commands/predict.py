@@ -88,9 +88,10 @@ def run(arguments: argparse.Namespace) -> None:
         unsaved = ("heights",) if arguments.check else ("heights", "failed")
         saved = predictions.save(unsaved, config=config, cell_size=trained.grid.spacing)
         shares = save_text(out / "shares.txt", f"{text}\n")
-        print(f"\n{text}\n\n{saved}\n{shares}")
+        print(f"\n{text}\n")
+        progress.wrote(saved, shares)
         if not arguments.no_figures:
-            print(_figure(maps, predictor, arguments.check, out))
+            progress.wrote(_figure(maps, predictor, arguments.check, out))
 
 
 def _predicted(batch: Batch, predictor: "Predictor", on_progress: Callable[[int], object]) -> Batch:

@@ -4,6 +4,7 @@ import argparse
 
 import numpy as np
 
+from travjax import progress
 from travjax.commands import options
 from travjax.files import output_folder, save_npz
 from travjax.grid import Grid
@@ -34,11 +35,11 @@ def run(arguments: argparse.Namespace) -> None:
     batches = synthetic_batches(names, seeds, grid, arguments.world)
     maps = joined(list(options.progress(batches, len(names), "terrain")))
     world = grid.size if arguments.world is None else arguments.world
-    print(save_npz(out / "terrain.npz", cell_size=grid.spacing, world=world, **maps))
+    progress.wrote(save_npz(out / "terrain.npz", cell_size=grid.spacing, world=world, **maps))
     for style in styles:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
         titles = [f"seed {seed}" for seed in maps["seed"][chosen]]
-        print(
+        progress.wrote(
             plots.save(
                 plots.contact_sheet(maps["heights"][chosen], titles, f"{style}: {len(chosen)} of {count} maps", grid),
                 out / f"terrain_{style}.png",

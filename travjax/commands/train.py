@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
     with going_on("with --resume the same command goes on from the latest checkpoint"):
         train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
     if devices.main:
-        print(f"\nNext: travjax evaluate {folder}{f' --data {data}' if data else ''}")
+        print(f"\n{one_line(f'Next: travjax evaluate {folder}' + (f' --data {data}' if data else ''))}")
 
 
 def train(
@@ -150,7 +150,7 @@ def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, r
     else:
         trainer.start(estimator)
         if devices.main and preset.model == RESNET:
-            print(_draw_inputs(trainer, folder))
+            progress.wrote(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:
         _finish(folder)
@@ -215,5 +215,5 @@ def _finish(folder: Path) -> None:
     rows = folder / "metrics.jsonl"
     progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
-        print(path)
-    print(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))
+        progress.wrote(path)
+    progress.wrote(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))

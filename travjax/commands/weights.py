@@ -4,6 +4,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder, user_path
@@ -71,7 +72,8 @@ def run(arguments: argparse.Namespace) -> None:
         weights = _fetched(arguments)
     path = output_folder(arguments.out) / "resnet50.safetensors"
     save_safetensors(weights, path)
-    print(describe(weights), f"\n{path}", sep="\n")
+    print(f"{describe(weights)}\n")
+    progress.wrote(path)
 
 
 def _told(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -298,7 +298,7 @@ def _write(parts: Sequence[Part], out: Path) -> None:
     numbers = {name: value for part in parts for name, value in part.numbers.items()}
     save_text(out / "results.json", json.dumps(numbers, indent=1, allow_nan=False) + "\n")
     report = launch.write_report(out, "Simulators and estimators", pieces)
-    print(report, out / "results.json", *(path for part in parts for path in part.files), sep="\n")
+    progress.wrote(report, out / "results.json", *(path for part in parts for path in part.files))
 
 
 def _points(

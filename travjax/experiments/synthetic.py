@@ -9,6 +9,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+from travjax import progress
 from travjax.bench import machine
 from travjax.commands import train
 from travjax.commands.evaluate import evaluate
@@ -58,7 +59,9 @@ def run(arguments: argparse.Namespace) -> None:
     with held(folder), going_on(launch.GOES_ON):
         train.train(wanted, folder, Devices.all(), resume=True)
         scores = evaluate(folder, out=folder / "evaluation")
-        print(launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder)))
+        progress.wrote(
+            launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder))
+        )
 
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:

@@ -149,7 +149,7 @@ def _write(rows: list[dict], headline: str, out: Path) -> None:
         bench.write_tsv(rows, temporary, COLUMNS)
     figure = plots.save(plots.timing_figure(rows), out / "timing.png")
     pieces: list[launch.Piece] = [f"{headline}.", launch.verbatim(table), MEANING, figure]
-    print(out / "timing.tsv", figure, launch.write_report(out, "All trajectories of a map", pieces), sep="\n")
+    progress.wrote(out / "timing.tsv", figure, launch.write_report(out, "All trajectories of a map", pieces))
 
 
 if __name__ == "__main__":

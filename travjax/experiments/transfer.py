@@ -182,7 +182,7 @@ def _write(transfer, results, out: Path) -> None:
         *figures,
     ]
     report = launch.write_report(out, "Transfer to real maps", pieces)
-    print(report, out / "results.json", *figures, sep="\n")
+    progress.wrote(report, out / "results.json", *figures)
 
 
 MEANING = (
