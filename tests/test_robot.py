@@ -145,6 +145,14 @@ def test_wheels_below_or_beyond_the_chassis_may_stand_close(outside):
     assert replace(SEEKUR_JR, track=0.3, **outside).track == 0.3
 
 
+def test_an_angle_given_in_degrees_is_shown_in_degrees(tmp_path):
+    path = tmp_path / "mine.toml"
+    for degrees in (91, -5, 0.001):
+        path.write_text(as_toml(name="Mine", max_tilt=None) + f"\nmax_tilt_deg = {degrees}")
+        with pytest.raises(InputError, match=f"max_tilt_deg = {degrees}: must be an angle from 0.01 to 90 deg"):
+            Robot.load(path)
+
+
 def test_a_limit_of_roll_is_told_the_limit_of_tilt(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(as_toml(max_tilt=None) + "\nmax_roll_deg = 30")

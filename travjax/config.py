@@ -100,7 +100,7 @@ def load_toml(path: str | Path, kind: type[Config]) -> Config:
     path = Path(os.path.expanduser(path))
     table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
     try:
-        return kind(**_fields_from(table, kind))
+        return _made(table, kind)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -210,6 +210,19 @@ def parts_from_json(table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
     return {name: from_json(table[name], kind) for name, kind in kinds.items()}
 
 
+def _made(table: dict, kind: type[Config]) -> Config:
+    """The configuration of a table; an angle that was given in degrees is named and shown as it was given."""
+    try:
+        return kind(**_fields_from(table, kind))
+    except InputError as error:
+        message = str(error)
+        for key, value in table.items():
+            field, _, allowed = message.partition(": must be ")
+            if allowed and key.endswith("_deg") and field.startswith(f"{key.removesuffix('_deg')} = "):
+                message = f"{key} = {shown(value)}: must be {allowed}"
+        raise InputError(message) from None
+
+
 def _fields_from(table: dict, kind: type) -> dict:
     names = {field.name: field for field in dataclasses.fields(kind)}
     values = {}
@@ -249,6 +262,6 @@ def _inner(key: str, table: object, kind: type, written: str, place: str) -> obj
     """The configuration of a table within a table; `place` names it in errors."""
     require(isinstance(table, dict), key, table, f"a table {written}")
     try:
-        return kind(**_fields_from(table, kind))  # type: ignore[arg-type]
+        return _made(table, kind)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{place} {error}") from None
