@@ -52,12 +52,14 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     return jnp.asarray(maps, jnp.float32), heights.ndim == 2
 
 
+@jax.jit
 def _unmarked(maps: jax.Array) -> jax.Array:
     """Heights with NaN in place of the usual marks of unknown ground; on the device, nobody waits for it."""
-    marked = maps == MARKERS[0]
+    heights = maps if maps.dtype == np.float64 else maps.astype(jnp.float32)
+    marked = heights == MARKERS[0]
     for mark in MARKERS[1:]:
-        marked |= maps == mark
-    return jnp.where(marked, jnp.nan, maps)
+        marked |= heights == mark
+    return jnp.where(marked, jnp.nan, heights)
 
 
 def _require_fine(maps: np.ndarray) -> None:
