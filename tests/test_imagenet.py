@@ -626,7 +626,30 @@ def test_weights_made_from_caffe_are_refused_unless_they_are_said_to_be(tmp_path
     weights = load_weights(path, NARROW, input="caffe", stride_in="1x1")
     wanted = torch_stages(caffe_arrays(folded), pixels_of("caffe", normalised()), v1_5=False)
     assert_close(run(weights, normalised(), width=4)[0], wanted["features"])
-    assert load_weights(path, NARROW, input="torch").arrays["conv1/kernel"].std() < 0.01  # who says so is believed
+    if folded:  # nothing of the numbers speaks against it
+        assert load_weights(path, NARROW, input="torch").arrays["conv1/kernel"].std() < 0.01
+    else:
+        with pytest.raises(InputError, match="made for larger values; travjax weights --from FILE --input caffe"):
+            load_weights(path, NARROW, input="torch")
+
+
+def test_an_input_that_the_numbers_speak_against_is_not_believed(tmp_path):
+    path = write(tmp_path / "a.safetensors", torchvision_arrays(canonical_arrays()))
+    load_weights(path, NARROW, input="torch")
+    with pytest.raises(InputError, match="made for smaller values; .* --input torch takes them as what they are"):
+        load_weights(path, NARROW, input="caffe", stride_in="1x1")
+
+
+def test_a_first_kernel_of_zeros_or_of_no_usual_size_is_refused(tmp_path):
+    for factor, reason in (
+        (0, "= 0 throughout: must be the kernel of a trained"),
+        (1e6, "there is no --input that it"),
+    ):
+        arrays = canonical_arrays()
+        arrays["conv1/kernel"] = arrays["conv1/kernel"] * np.float32(factor)
+        path = write(tmp_path / "a.safetensors", torchvision_arrays(arrays))
+        with pytest.raises(InputError, match=reason):
+            load_weights(path, NARROW)
 
 
 def test_weights_of_keras_for_small_pixels_are_refused(tmp_path):
@@ -635,7 +658,7 @@ def test_weights_of_keras_for_small_pixels_are_refused(tmp_path):
     path = write(tmp_path / "a.h5", arrays)
     message = refusal(path)
     assert message.startswith("conv1_bn/moving_variance = ") and "made for smaller values; " in message
-    assert "--input torch takes them as what they are (or tf or unit)" in message
+    assert "--input torch takes them as what they are (or torch-bgr or tf or unit)" in message
     wanted = canonical_arrays()["conv1/kernel"]
     np.testing.assert_array_equal(load_weights(path, NARROW, input="torch").arrays["conv1/kernel"], wanted)
 

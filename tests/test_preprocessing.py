@@ -71,10 +71,13 @@ def test_a_layer_is_converted_to_what_it_was(trained, name):
         ("caffe", "torch", "--input caffe --stride-in 1x1 "),
         ("caffe-rgb", "torch", "(or caffe-rgb)"),
         ("torch", "caffe", "--input torch "),
-        ("tf", "caffe", "(or tf or unit)"),
-        ("unit", "caffe", "(or tf or unit)"),
+        ("tf", "caffe", "(or torch-bgr or tf or unit)"),
+        ("unit", "caffe", "(or torch-bgr or tf or unit)"),
         ("tf", "torch", "--input tf "),
         ("unit", "torch", "--input unit "),
+        ("torch", "tf", "--input must be another one"),
+        ("torch", "unit", "--input must be another one"),
+        ("unit", "tf", "--input must be another one"),
     ],
 )
 def test_a_layer_that_is_taken_for_another_is_refused(trained, name, assumed, option):

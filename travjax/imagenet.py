@@ -95,7 +95,7 @@ def load_weights(
             left_out = tuple(f"{shown(name)} {list(file.arrays[name].shape)}" for name in network.left_out)
         settings = _settings(file, network, input, stride_in, path)
         replace(config, stride_in=settings["stride_in"], epsilon=settings["epsilon"])  # raises unless they are allowed
-        arrays = _canonical(arrays, network, settings["input"], told=input is not None or bool(file.notes))
+        arrays = _canonical(arrays, network, settings["input"], told=input is not None, ours=bool(file.notes))
         return Weights(arrays, str(path), network.naming.title, left_out=left_out, **settings)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -172,14 +172,17 @@ def _float32(array: np.ndarray) -> np.ndarray:
         return array.astype(np.float32)
 
 
-def _canonical(arrays: dict[str, np.ndarray], network: Recognised, input: str, told: bool) -> dict[str, np.ndarray]:
+def _canonical(
+    arrays: dict[str, np.ndarray], network: Recognised, input: str, told: bool, ours: bool
+) -> dict[str, np.ndarray]:
     """Arrays in the canonical layout, for the canonical input; a convolution's bias is taken off the mean that is
     subtracted from its output.
 
-    told: the input is known, and not looked for in the numbers
+    told: the input is the user's word, who may have weights without statistics
+    ours: the file is one of `travjax weights`, whose input was looked for when it was made
     """
     names = {canonical: shown(name) for name, (canonical, _) in network.expected.items()}
-    if not told:
+    if not (told or ours):
         require_statistics(arrays, names)
     measured = has_statistics(arrays)
     if network.naming.by_output:
@@ -189,7 +192,7 @@ def _canonical(arrays: dict[str, np.ndarray], network: Recognised, input: str, t
         for layer in [name.removesuffix("/mean") for name in arrays if name.endswith("/mean")]:
             arrays[f"{layer}/mean"] -= arrays.pop(f"{layer}/bias")
     arrays = converted(arrays, INPUTS[input])
-    if measured and not told:
+    if measured and not ours:
         require_fit(arrays, input, names)
     return arrays
 

@@ -34,6 +34,9 @@ resnet50_imagenet.npz, 0.05 for random numbers)."""
 FEWEST = 16
 """Filters that this takes."""
 
+FAR = 0.15
+"""Difference of means of colours, in the same units, from which on an input that was given is not believed."""
+
 NEAR = 0.06
 """Difference of means of colours, in units of (x / 255 - mean) / std; 0.04 in resnet50_imagenet.npz."""
 
@@ -120,37 +123,50 @@ def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, st
     """
     kernel, mean, var = (arrays[f"conv1/{kind}"].astype(np.float64) for kind in ("kernel", "mean", "var"))
     squares = (kernel**2).sum(axis=(0, 1, 2))
+    if not squares.any():
+        raise InputError(f"{names['conv1/kernel']} = 0 throughout: must be the kernel of a trained network")
     live = (squares > 0) & (arrays["conv1/gamma"] != 0)
     if not live.any():
         return
     ratio = float(np.quantile(var[live] / squares[live], 0.75))
     if not LEAST <= ratio <= MOST:
-        larger = ratio > MOST
-        suggested = FROM_CAFFE if larger else "torch"
-        others = "caffe-rgb" if larger else "tf or unit"
+        size = "larger" if ratio > MOST else "smaller"
         raise InputError(
             f"{names['conv1/var']} = {ratio:.2g} times the squares of {names['conv1/kernel']}, upper quartile: must be "
-            f"{LEAST} to {MOST:.0f}, as from {INPUTS[assumed].text}: made for {'larger' if larger else 'smaller'} "
-            f"values; {CONVERT.format(suggested)} (or {others})"
+            f"{LEAST} to {MOST:.0f}, as from {INPUTS[assumed].text}: made for {size} values; {_fitting(ratio, assumed)}"
         )
-    told = _told_by_means(kernel[..., live], mean[live])
-    if told:
+    colours = _mean_of_colours(kernel[..., live], mean[live])
+    if colours is None:
+        return
+    # In a kernel that is taken for one of y, scale * y + offset has the mean `offset`.
+    meant = [name for name in ("tf", "unit") if np.abs(colours - INPUTS[name].offset).max() < NEAR]
+    if assumed.startswith("torch") and meant:
         raise InputError(
-            f"{names['conv1/mean']} = what pixels of {INPUTS[told].text} give: must be of {INPUTS[assumed].text}; "
-            f"{CONVERT.format(told)}, and --input {assumed} if that is wrong"
+            f"{names['conv1/mean']} = what pixels of {INPUTS[meant[0]].text} give: must be of {INPUTS[assumed].text}; "
+            f"{CONVERT.format(meant[0])}, and --input {assumed} if that is wrong"
+        )
+    if INPUTS[assumed].offset.any() and np.abs(colours).max() > FAR:
+        raise InputError(
+            f"{names['conv1/mean']} = what pixels of another mean give than {INPUTS[assumed].text}: --input must be "
+            "another one, or be left out"
         )
 
 
-def _told_by_means(kernel: np.ndarray, mean: np.ndarray) -> str | None:
-    """The input whose mean is that of the colours that explains the first running means, where it is not 0."""
+def _fitting(ratio: float, assumed: str) -> str:
+    """Under which inputs a first kernel of that ratio of variance to squares, canonical from `assumed`, would fit."""
+    scale = {name: float(np.mean(given.scale)) for name, given in INPUTS.items()}
+    fitting = [name for name in INPUTS if LEAST <= ratio * (scale[assumed] / scale[name]) ** 2 <= MOST]
+    if not fitting:
+        return "there is no --input that it would fit"
+    first, others = (FROM_CAFFE if fitting[0] == "caffe" else fitting[0]), " or ".join(fitting[1:])
+    return CONVERT.format(first) + (f" (or {others})" if others else "")
+
+
+def _mean_of_colours(kernel: np.ndarray, mean: np.ndarray) -> np.ndarray | None:
+    """The mean of R, G and B [3] that explains the first running means; None where it does not, or where they are 0."""
     sums = kernel.sum(axis=(0, 1)).T
     if len(mean) < FEWEST or not mean.any():
         return None
     colours = np.linalg.lstsq(sums, mean, rcond=None)[0]
-    if 1 - np.sum((mean - sums @ colours) ** 2) / np.sum(mean**2) < EXPLAINED:
-        return None
-    # In a kernel that is taken for one of y, scale * y + offset has the mean `offset`.
-    for name in ("tf", "unit"):
-        if np.abs(colours - INPUTS[name].offset).max() < NEAR:
-            return name
-    return None
+    explained = 1 - np.sum((mean - sums @ colours) ** 2) / np.sum(mean**2)
+    return colours if explained >= EXPLAINED else None
