@@ -5,6 +5,7 @@ Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest
 
 import math
 import os
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,6 +22,10 @@ from travjax.actions import ActionSpace
 from travjax.grid import Grid
 from travjax.robot import Robot
 from travjax.terrain import STYLES, generate_terrain
+
+# A runner in the background ignores interrupts, and so would the programs that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "JAX_PLATFORMS" not in os.environ:
     jax.config.update("jax_platforms", "cpu")

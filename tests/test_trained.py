@@ -158,7 +158,32 @@ def test_a_checkpoint_that_is_not_there_is_one_line(trained, tmp_path):
 def test_the_checkpoint_of_another_network_is_one_line(trained, tmp_path):
     folder = copy(trained, tmp_path / "run")
     replace(run_of(), preset=replace(PRESET, heads=replace(PRESET.heads, hidden=8))).save(folder)
-    assert "other arrays than the network and optimiser have: heads/" in refusal(load_estimator, folder, "heads")
+    assert refusal(load_estimator, folder, "heads") == (
+        f"{folder}/run.json: preset.heads.hidden = 8: must be 16, as in the run so far"
+    )
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value"),
+    [("preset", "elevation_scale", 9.0), ("robot", "track", 0.9), ("actions", "interval", 0.16)],
+)
+def test_a_run_json_with_another_number_than_was_trained_with_is_refused(trained, tmp_path, part, name, value):
+    folder = copy(trained, tmp_path / "run")
+    table = json.loads((folder / "run.json").read_text())
+    assert table[part][name] != value
+    table[part][name] = value
+    (folder / "run.json").write_text(json.dumps(table))
+    message = refusal(load_estimator, folder)
+    assert message.startswith(f"{folder}/run.json: {part}") and name in message
+
+
+def test_hidden_files_that_others_leave_in_a_checkpoint_do_not_count(trained, tmp_path):
+    folder = copy(trained, tmp_path / "run")
+    for checkpoint in (folder / "checkpoints").iterdir():
+        (checkpoint / ".DS_Store").write_text("Finder")
+        (checkpoint / "state" / ".nfs0001").write_text("NFS")
+    one, other = (host(take_apart(load_estimator(place)[1])[1]) for place in (folder, trained))
+    require_equal(one, other)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -166,7 +191,8 @@ def test_an_estimator_with_a_number_that_is_none_is_refused(tmp_path, value):
     run_of().save(tmp_path)
     variables = take_apart(create(PRESET.trunk, PRESET.heads))[1]
     spoilt = jax.tree.map(lambda leaf: leaf.at[0].set(value) if leaf.ndim == 1 else leaf, variables)
-    meta = {"optimizer": 0, "position": {}, "dataset": ""}
+    position = {"phase": 1, "epoch": 0, "step": 0, "total": 0, "loss": 0.0, "samples": 0, "best": 0.0}
+    meta = {"optimizer": 0, "position": position, "dataset": "", "run": run_of().to_json()}
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     checkpoints.save(1, variables, meta, best=True)
     checkpoints.save(2, spoilt, meta)

@@ -20,7 +20,7 @@ import shutil
 import textwrap
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -78,9 +78,21 @@ class Checkpoints:
         template: pytree of arrays or `jax.ShapeDtypeStruct` of the same structure, dtypes and shapes, whose shardings
             are taken over (a NumPy array where there is none); or a function that gives it for the checkpoint's meta.
             Without a template: nested dicts of NumPy arrays
-        A damaged checkpoint is passed over for the one before it, with a notice.
+        A damaged checkpoint is passed over for the one before it, with a notice; one that training removes meanwhile,
+        for the newer one.
         Raises InputError when none is good, or the template's arrays are others.
         """
+        while True:
+            path, saved = self._newest_good(which)
+            chosen = template(saved["meta"]) if callable(template) else template
+            try:
+                return _load(path, saved["arrays"], chosen), saved["meta"]
+            except _Unreadable as error:
+                with suppress(_Damaged):  # removed or altered since it was checked
+                    _checked(path, arrays=True)
+                    raise InputError(f"{path}: {error}; allowed: another checkpoint") from None
+
+    def _newest_good(self, which: str) -> tuple[Path, dict]:
         damaged: dict[Path, str] = {}
         try:
             path, saved = _newest_good(self.folder, which, damaged, arrays=True)
@@ -89,8 +101,7 @@ class Checkpoints:
             self.notices = [f"{path}: damaged checkpoint passed over: {why}" for path, why in damaged.items()]
         if damaged:
             self.notices.append(f"{path}: is used instead")
-        chosen = template(saved["meta"]) if callable(template) else template
-        return _load(path, saved["arrays"], chosen), saved["meta"]
+        return path, saved
 
     def _save(self, label: str, state: PyTree, meta: dict) -> None:
         arrays = _named_leaves(state)
@@ -183,6 +194,9 @@ def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: boo
         try:
             return path, _checked(path, arrays)
         except _Damaged as error:
+            if _checkpoints(folder) != found:  # training goes on there, and may have removed it for a newer one
+                damaged.clear()
+                return _newest_good(folder, which, damaged, arrays)
             damaged[path] = str(error)
     reasons = "; ".join(f"{path.name}: {why}" for path, why in damaged.items())
     raise InputError(f"{folder}: holds no checkpoint {which!r} that is whole: {reasons}")
@@ -190,6 +204,10 @@ def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: boo
 
 class _Damaged(Exception):
     """What is wrong with a checkpoint's files."""
+
+
+class _Unreadable(Exception):
+    """Why Orbax cannot read arrays."""
 
 
 def _checked(path: Path, arrays: bool) -> dict:
@@ -216,8 +234,10 @@ def _checked(path: Path, arrays: bool) -> dict:
 
 
 def _files(path: Path) -> dict[str, Path]:
+    """The files by path, but hidden ones, which Finder, NFS and the like leave there and Orbax does not read."""
     files = sorted(file for file in path.rglob("*") if not file.is_dir() and file.name != "SHA256SUMS")
-    return {file.relative_to(path).as_posix(): file for file in files}
+    named = {file.relative_to(path).as_posix(): file for file in files}
+    return {name: file for name, file in named.items() if not f"/{name}".count("/.")}
 
 
 def _named_leaves(tree: PyTree) -> dict[str, Any]:
@@ -252,7 +272,8 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
     except MemoryError:
         raise
     except Exception as error:  # Orbax and TensorStore raise whatever their parsers do; the checksums were in order
-        raise InputError(f"{path}: state: cannot be read: {_reason(error)}") from None
+        reason = textwrap.shorten(_reason(error), 80, placeholder=" ...")
+        raise _Unreadable(f"state: cannot be read: {reason}") from None
     if template is None:
         return unflatten_dict(arrays, sep="/")
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in leaves])

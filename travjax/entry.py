@@ -69,7 +69,7 @@ def guarded(work: Callable[[], object]) -> int:
             _drop_output()
             return 1
         except OSError as error:  # a name too long, no permission
-            return _ended(2, f"{error.filename or 'output'}: {error.strerror or error}")
+            return _ended(2, f"{error.filename or 'a file'}: {error.strerror or error}")
         except (MemoryError, RuntimeError) as error:
             if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's
                 raise

@@ -131,7 +131,7 @@ class Run:
 def _settings(mine: Any, other: Any, prefix: str = ""):
     for field in dataclasses.fields(mine):
         name, ours, theirs = prefix + field.name, getattr(mine, field.name), getattr(other, field.name)
-        if dataclasses.is_dataclass(ours):
+        if dataclasses.is_dataclass(ours) and type(theirs) is type(ours):
             yield from _settings(ours, theirs, f"{name}.")
         else:
             yield name, ours, theirs
@@ -143,8 +143,12 @@ def has_checkpoints(folder: Path) -> bool:
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
-def checked_meta(meta: dict, folder: str | Path) -> dict:
-    """Returns what training said of a checkpoint; raises InputError that names the run's folder where it did not."""
+def checked_meta(meta: dict, folder: str | Path, run: Run) -> dict:
+    """Returns what training said of a checkpoint of a run.
+
+    Raises InputError that names the run's folder where it did not say it, and run.json where the checkpoint was trained
+    with other settings than those of `run`; older checkpoints do not say with which.
+    """
     where, told = f"{folder}: meta of a checkpoint", meta.get("position")
     position = told if isinstance(told, dict) else {}
     require(meta.get("optimizer") in (0, 1, 2), f"{where}: optimizer", meta.get("optimizer"), "0, 1 or 2")
@@ -153,6 +157,12 @@ def checked_meta(meta: dict, folder: str | Path) -> dict:
     summed = all(type(position.get(name)) in (int, float) and abs(position[name]) < math.inf for name in SUMS)
     whole = counted and summed and position["phase"] in (1, 2) and len(position) == len(COUNTS + SUMS)
     require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
+    if "run" in meta:
+        try:
+            trained = Run.from_json(meta["run"])
+        except InputError as error:
+            raise InputError(f"{where}: run: {error}") from None
+        trained.require_same(run, f"{user_path(folder) / 'run.json'}")
     return meta
 
 
@@ -161,11 +171,12 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
-    Raises InputError when there is none, it is damaged, or a number of it is not finite.
+    Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or a
+    number of it is not finite.
     """
     run = Run.load(folder)
     checkpoints = Checkpoints(user_path(folder) / "checkpoints")
-    state, meta = checkpoints.restore(lambda meta: run.template(checked_meta(meta, folder)["optimizer"]), which)
+    state, meta = checkpoints.restore(lambda meta: run.template(checked_meta(meta, folder, run)["optimizer"]), which)
     for notice in checkpoints.notices:
         print(one_line(notice))
     variables = {name: state[name] for name in VARIABLES}

@@ -127,7 +127,7 @@ class Transfer:
         place, run = self.place_of(arm, seed), self.run_of(arm, seed)
         if has_checkpoints(place):
             self._require_same(place, run)
-        if not self._is_finished(place):
+        if not self._is_finished(place, run):
             self._train(arm, seed, place)
         path = place / "metrics.jsonl"
         rows = [row for row in read_rows(path) if "watched" in row]
@@ -153,12 +153,12 @@ class Transfer:
         first = begun.preset.weights
         require(first == run.preset.weights, f"{place}: weights", run.preset.weights, f"{first}, as in the run so far")
 
-    def _is_finished(self, place: Path) -> bool:
+    def _is_finished(self, place: Path, run: Run) -> bool:
         try:
             meta = load_meta(place / "checkpoints")
         except InputError:
             return False
-        checked_meta(meta, place)
+        checked_meta(meta, place, run)
         begun, given = meta["dataset"], self.dataset.fingerprint
         require(begun == given, f"{place}: data set", given, f"{begun}, the one that the run was trained on")
         return meta["position"]["epoch"] == self.config.epochs
