@@ -99,7 +99,7 @@ def test_heights_in_feet_are_refused_unless_they_are_scaled():
     require_metric(None, 0, 0, False)
 
 
-@pytest.mark.parametrize("unit", [None, "", "m", "metre", "Meters", "m above the geoid"])
+@pytest.mark.parametrize("unit", [None, "", "unspecified", "m", "metre", "Meters", "m above the geoid"])
 def test_units_that_are_metres_are_taken(unit):
     require_height_unit_named("band 1", unit, False)
 

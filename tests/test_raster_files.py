@@ -185,6 +185,27 @@ def test_a_variable_of_a_netcdf_is_read_by_its_name(tmp_path):
     assert refusal(path, band="depth").startswith("band 1: has heights in units of 0.01 m (cm)")
 
 
+def test_a_netcdf_in_degrees_is_refused_without_a_coordinate_system_too(tmp_path):
+    with h5py.File(tmp_path / "a.nc", "w") as file:
+        for name, first, count, unit in (("lat", 46.0, 20, "degrees_north"), ("lon", 7.0, 24, "degrees_east")):
+            axis = file.create_dataset(name, data=first + CELL * np.arange(count))
+            axis.make_scale(name)
+            axis.attrs["units"] = unit
+        variable = file.create_dataset("z", data=HEIGHTS)
+        for k, axis in enumerate(("lat", "lon")):
+            variable.dims[k].attach_scale(file[axis])
+    assert refusal(tmp_path / "a.nc").endswith(": is in degrees; reproject it to metres (a UTM zone, say)")
+
+
+def test_an_opacity_beside_heights_is_no_band_to_choose(tmp_path):
+    opacity = np.full_like(HEIGHTS, 255)
+    opacity[0, 0] = 0
+    path = write(tmp_path / "a.tif", np.stack([HEIGHTS, opacity]), alpha="yes")
+    expected = HEIGHTS.copy()
+    expected[0, 0] = np.nan
+    np.testing.assert_array_equal(read(path), expected)
+
+
 def test_a_netcdf_of_one_variable_needs_no_name(tmp_path):
     np.testing.assert_array_equal(read(write_netcdf(tmp_path / "a.nc", z=(HEIGHTS, "m"))), HEIGHTS)
 

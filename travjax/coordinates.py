@@ -26,6 +26,9 @@ NEAR_ORIGIN = 100_000.0
 METRE_NAMES = re.compile(r"(m|met(er|re)s?)(?![\w/*^-])", re.IGNORECASE)
 """What a unit of metres begins with, as in "m above the geoid"."""
 
+NO_UNIT = ("unspecified", "unknown", "none", "undefined")
+"""What formats call a unit that was not said."""
+
 UNIT_METRES = {
     r"(ft|foot|feet|international foot)": 0.3048,
     r"(ftus|us[-_ ]?(survey[-_ ]?)?(ft|foot|feet)|foot_us|us-ft)": 1200 / 3937,
@@ -157,6 +160,7 @@ def require_height_unit(where: str, unit: str, metres: float, heights_scaled: bo
 def require_height_unit_named(where: str, unit: str | None, heights_scaled: bool) -> None:
     """Raises InputError unless a unit of height, as a file names it, is metres or none, or a height scale was given."""
     named = (unit or "").strip()
+    named = "" if named.lower() in NO_UNIT else named
     if heights_scaled or not named or METRE_NAMES.match(named):
         return
     for pattern, metres in UNIT_METRES.items():

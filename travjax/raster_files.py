@@ -5,6 +5,7 @@ and a file beside the raster that GDAL would open by itself is looked at first.
 """
 
 import os
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -61,6 +62,7 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
         if not is_real(dtype):
             raise InputError(f"heights: {dtype}: must be numbers")
         _require_metres(file, band, placed, options)
+        _require_no_degrees(file)
         crs = parsed(file.crs.to_wkt()) if file.crs else None
         cell_size, origin, southern = _place(file, placed, options.cell_size)
         east, north = (origin[k] + cell_size * (edge - 1) / 2 for k, edge in enumerate(file.shape[::-1]))
@@ -230,7 +232,10 @@ def _band(file: Any, wanted: int | str | None) -> int:
     if wanted is not None:
         require(wanted <= file.count, "--band", wanted, f"at most {file.count}, the number of bands")
         return wanted
-    if file.count == 1 or _is_grey(file):
+    alone = [band for band in file.indexes if not _is_opacity(file, band)]
+    if len(alone) == 1:
+        return alone[0]
+    if _is_grey(file):
         return 1
     named = f" ({', '.join(names)})" if any(names) else ""
     raise InputError(
@@ -238,13 +243,17 @@ def _band(file: Any, wanted: int | str | None) -> int:
     )
 
 
+def _is_opacity(file: Any, band: int) -> bool:
+    from rasterio.enums import ColorInterp
+
+    return file.count > 1 and file.colorinterp[band - 1] == ColorInterp.alpha
+
+
 def _is_grey(file: Any) -> bool:
     """Whether a picture of colours, or one with an opacity, holds one grey that is no flat colour."""
     if set(file.dtypes) - {"uint8", "uint16"} or file.count > 4:
         return False
-    from rasterio.enums import ColorInterp
-
-    colours = [band for band in file.indexes if file.colorinterp[band - 1] != ColorInterp.alpha]
+    colours = [band for band in file.indexes if not _is_opacity(file, band)]
     lowest, highest = np.inf, -np.inf
     for _, window in file.block_windows(1):
         first, *others = file.read(colours, window=window)
@@ -258,10 +267,20 @@ def _require_metres(file: Any, band: int, placed: bool, options: DemOptions) -> 
     """Refuses values that nothing says to be metres: pictures, and units of a band that are none or others."""
     scaled = options.height_scale is not None
     bare = not placed and not file.crs and file.driver == "GTiff"
-    if not scaled and (file.driver in PICTURES or bare or file.count > 1 and options.band is None):
+    grey = file.count > 1 and options.band is None and set(file.dtypes) <= {"uint8", "uint16"}
+    if not scaled and (file.driver in PICTURES or bare or grey):
         what = f"a {file.driver}" if not bare else "a TIFF without a place on the ground"
         raise InputError(f"height_scale is missing: {what} holds no metres; give it (--height-scale METRES)")
     require_height_unit_named(f"band {band}", file.units[band - 1], scaled)
+
+
+def _require_no_degrees(file: Any) -> None:
+    """Refuses a netCDF whose axes are in degrees, of which GDAL makes no coordinate system."""
+    for name, unit in file.tags().items():
+        if name.endswith("#units") and re.fullmatch(r"degrees?_(north|east|N|E)", unit):
+            raise InputError(
+                f"{name.partition('#')[0]} = {unit}: is in degrees; reproject it to metres (a UTM zone, say)"
+            )
 
 
 def _place(file: Any, placed: bool, cell_size: float | None) -> tuple[float, tuple[float, float], bool]:
