@@ -71,7 +71,7 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
         in_metres = scale, file.offsets[band - 1]
         if np.prod(file.shape) <= WHOLE or file.driver in PICTURES:
             require_memory(3 * int(np.prod(file.shape)) * dtype.itemsize, f"{file.width} x {file.height} pixels")
-            heights: HeightSource = _in_metres(file.read(band, masked=True), in_metres, options.nodata, southern)
+            heights: HeightSource = _in_metres(_read(file, band), in_metres, options.nodata, southern)
         else:
             heights = _FromFile(file, band, in_metres, options.nodata, southern)
     return Raster(heights, cell_size, origin, name_of(crs), marks_nothing(options.nodata, dtype))
@@ -196,8 +196,17 @@ class _FromFile:
         north = rows if self._southern else slice(edge - rows.stop, edge - rows.start)
         with _gdal():
             window = Window.from_slices((north.start, north.stop), (cols.start, cols.stop))
-            read = self._file.read(self._band, window=window, masked=True)
+            read = _read(self._file, self._band, window)
         return _in_metres(read, self._in_metres, self._nodata, self._southern)[:, :]
+
+
+def _read(file: Any, band: int, window: Any = None) -> np.ma.MaskedArray:
+    """The pixels of a band; those that are not known, or wholly transparent, are masked."""
+    read = file.read(band, window=window, masked=True)
+    for other in file.indexes:
+        if other != band and _is_opacity(file, other):  # GDAL masks by it for whole numbers alone
+            read = np.ma.masked_where(file.read(other, window=window) == 0, read)
+    return read
 
 
 def _in_metres(
