@@ -468,6 +468,7 @@ HEADS = {
     "without a bias": {"fc.weight": (1000, FEATURES)},
     "of two layers": {"fc.0.weight": (64, FEATURES), "fc.0.bias": (64,), "fc.2.weight": (5, 64), "fc.2.bias": (5,)},
     "of another name": {"last_linear.weight": (1000, FEATURES), "last_linear.bias": (1000,)},
+    "of two sizes": {"fc.weight": (1000, FEATURES), "fc.bias": (10,)},
     "with a norm": {"head.1.weight": (9, FEATURES), "head.0.weight": (FEATURES,), "head.0.running_var": (FEATURES,)},
 }
 
@@ -642,14 +643,22 @@ def test_an_input_that_the_numbers_speak_against_is_not_believed(tmp_path):
 
 def test_a_first_kernel_of_zeros_or_of_no_usual_size_is_refused(tmp_path):
     for factor, reason in (
-        (0, "= 0 throughout: must be the kernel of a trained"),
-        (1e6, "there is no --input that it"),
+        (0, "^conv1.weight = 0 throughout: must be the kernel of a network$"),
+        (1e6, "; there is no --input that it would fit$"),
     ):
         arrays = canonical_arrays()
         arrays["conv1/kernel"] = arrays["conv1/kernel"] * np.float32(factor)
-        path = write(tmp_path / "a.safetensors", torchvision_arrays(arrays))
-        with pytest.raises(InputError, match=reason):
-            load_weights(path, NARROW)
+        assert re.search(reason, refusal(write(tmp_path / "a.safetensors", torchvision_arrays(arrays))))
+
+
+@pytest.mark.parametrize("told", [None, "torch"])
+@pytest.mark.parametrize("fresh", [{}, {"gamma": 1, "var": 1}])
+def test_weights_of_zeros_are_refused(tmp_path, fresh, told):
+    """Neither measured nor, with statistics of 0 and 1, a network before training."""
+    zeros = {name: np.full_like(array, fresh.get(name.split("/")[1], 0)) for name, array in canonical_arrays().items()}
+    path = write(tmp_path / "a.safetensors", torchvision_arrays(zeros))
+    with pytest.raises(InputError, match="conv1.weight = 0 throughout: must be the kernel of a network$"):
+        load_weights(path, NARROW, input=told)
 
 
 def test_weights_of_keras_for_small_pixels_are_refused(tmp_path):
@@ -706,7 +715,7 @@ def test_converted_weights_that_were_damaged_are_refused(tmp_path):
     damaged = bytearray(path.read_bytes())
     damaged[-1000] ^= 1
     path.write_bytes(damaged)
-    assert re.search(r" = [0-9a-f]{8}\.\.\. \(SHA-256\): must be [0-9a-f]{8}\.\.\.: the file is damaged", refusal(path))
+    assert re.search(r"^the SHA-256 of \S+ is not the one that the file gives: the file is damaged$", refusal(path))
 
 
 # Our .npz
@@ -906,14 +915,27 @@ def test_a_truncated_file_is_refused(tmp_path, suffix, kept):
     whole = path.read_bytes()
     path.write_bytes(whole[: int(kept * len(whole))])
     message = refusal(path)
+    if kept == 0:
+        assert message == "is empty: must be a file of weights"
+        return
     assert message.startswith((f"cannot be read as {suffix}, damaged or something else: ", "holds pickled code, which"))
 
 
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"<html>404 not found</html>\n" * 40, "is an HTML page: must be a file of weights; "),
+        (b"\xef\xbb\xbf\n<!DOCTYPE html>\n<title>Sign in</title>", "is an HTML page: must be a file of weights; "),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:12ab\nsize 9\n", "is a Git LFS pointer: must be "),
+        (b"Of mountains & rivers\n" * 40, ""),
+    ],
+    ids=["page", "login", "pointer", "text"],
+)
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_file_of_something_else_is_refused(tmp_path, suffix):
+def test_a_file_of_something_else_is_refused(tmp_path, suffix, content, reason):
     path = tmp_path / f"a{suffix}"
-    path.write_text("<html>404 not found</html>\n" * 40)
-    refusal(path)
+    path.write_bytes(content)
+    assert refusal(path).startswith(reason)
 
 
 def test_bits_that_turned_over_in_an_npz_are_noticed(tmp_path):

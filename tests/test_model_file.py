@@ -96,7 +96,7 @@ def test_a_folder_is_no_file(tmp_path):
 @pytest.mark.parametrize("left", [0, 5, 200, -1])
 def test_a_file_that_was_cut_off_is_refused(file, left):
     file.write_bytes(file.read_bytes()[:left])
-    assert "damaged" in refusal(file)
+    assert ("damaged" if left else "is empty") in refusal(file)
 
 
 def test_arrays_of_something_else_are_refused(tmp_path):
@@ -186,7 +186,7 @@ def test_a_damaged_array_is_named(file):
     name, told = sorted(load_header(content).items())[0]
     content[8 + struct.unpack("<Q", content[:8])[0] + told["data_offsets"][0]] ^= 1
     file.write_bytes(content)
-    assert refusal(file).startswith(f"{name} = ") and refusal(file).endswith("the file is damaged")
+    assert refusal(file) == f"the SHA-256 of {name} is not the one that the file gives: the file is damaged"
 
 
 def load_header(content: bytes) -> dict:
@@ -204,7 +204,7 @@ def test_an_altered_setting_is_refused(file, setting):
         table = table[place]
     table[last] *= 1.01
     rewritten(file, described={"travjax": json.dumps(told)})
-    assert refusal(file).startswith("the description = ")
+    assert refusal(file).startswith("the SHA-256 of the description is not the one that ")
 
 
 def test_a_file_without_checksums_is_read_and_said_to_have_none(file, capsys):

@@ -75,19 +75,40 @@ def test_a_layer_is_converted_to_what_it_was(trained, name):
         ("unit", "caffe", "(or torch-bgr or tf or unit)"),
         ("tf", "torch", "--input tf "),
         ("unit", "torch", "--input unit "),
-        ("torch", "tf", "--input must be another one"),
-        ("torch", "unit", "--input must be another one"),
-        ("unit", "tf", "--input must be another one"),
+        ("torch", "tf", "--input torch "),
+        ("torch", "unit", "--input torch "),
+        ("unit", "tf", "--input unit "),
+        ("tf", "unit", "--input tf "),
+        ("tf", "torch-bgr", "--input tf "),
+        ("unit", "torch-bgr", "--input unit "),
     ],
 )
 def test_a_layer_that_is_taken_for_another_is_refused(trained, name, assumed, option):
     message = told(made_for(trained, name), assumed)
     assert message and option in message and "first." in message and "\n" not in message
+    assert f"--input {assumed} " not in message  # it would be refused again
+
+
+@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("colours", [(0.1, -0.1, 0.1), (-0.3, -0.3, -0.3), (0.2, 0.2, 0.1)], ids=str)
+def test_a_layer_of_images_of_another_mean_is_believed(trained, name, colours):
+    """Those of a survey, say, are darker or lighter than ImageNet's."""
+    sums = trained["conv1/kernel"].sum((0, 1)).T
+    layer = trained | {"conv1/mean": trained["conv1/mean"] + sums @ np.array(colours)}
+    assert told(made_for(layer, name), name) is None
 
 
 @pytest.mark.parametrize(("name", "assumed"), [("torch-bgr", "torch"), ("caffe-rgb", "caffe")])
 def test_the_order_of_the_colours_cannot_be_told(trained, name, assumed):
     assert told(made_for(trained, name), assumed) is None
+
+
+@pytest.mark.parametrize(("factor", "fitting"), [(1e6, None), (255, None), (1e-6, None), (1 / 255, "caffe")])
+def test_only_inputs_that_a_layer_would_fit_are_named(trained, factor, fitting):
+    layer = trained | {"conv1/kernel": trained["conv1/kernel"] * np.float32(factor)}
+    hint = f"--input {fitting} --stride-in 1x1 takes" if fitting else "; there is no --input that it would fit"
+    assert hint in (told(layer, "torch") or "")
+    assert [name for name in INPUTS if told(layer, name) is None] == (["caffe", "caffe-rgb"] if fitting else [])
 
 
 def test_the_sizes_that_are_allowed_hold_whatever_images_are_taken_in():

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 from safetensors.numpy import save_file
 
 from travjax.config import InputError
@@ -144,11 +145,31 @@ def test_numbers_that_are_none_are_not_written(tmp_path, value):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("sums", [[], "x", 3, {}, {"__metadata__": 5}, {"__metadata__": None, "a": "0"}])
-def test_checksums_that_are_none_are_refused(tmp_path, sums):
+@pytest.mark.parametrize(
+    ("sums", "wrong"),
+    [(sums, "is missing") for sums in ([], "x", 3, {}, {"__metadata__": None, "a": "0"})]
+    + [({"__metadata__": told}, "is not the one that the file gives") for told in (5, "", "0" * 64)],
+)
+def test_checksums_that_are_none_are_refused(tmp_path, sums, wrong):
     notes = {"travjax": json.dumps(NOTES | {"sha256": sums})}
     save_file(ARRAYS, tmp_path / "a.safetensors", metadata=notes)
-    assert "the description = " in refusal(tmp_path / "a.safetensors")
+    assert refusal(tmp_path / "a.safetensors") == f"the SHA-256 of the description {wrong}: the file is damaged"
+
+
+@pytest.mark.parametrize(
+    ("altered", "wrong"),
+    [(None, "is missing"), ("last digit", "is not the one that the file gives")],
+)
+def test_a_checksum_of_an_array_that_is_damaged_is_said_to_be(tmp_path, altered, wrong):
+    path = tmp_path / "a.safetensors"
+    write_safetensors(path, ARRAYS, NOTES)
+    with safe_open(path, framework="np") as file:
+        notes = json.loads(file.metadata()["travjax"])
+    digits = notes["sha256"].pop("b/c")
+    if altered:
+        notes["sha256"]["b/c"] = digits[:-1] + ("1" if digits[-1] == "0" else "0")
+    save_file(ARRAYS, path, metadata={"travjax": json.dumps(notes)})
+    assert refusal(path, "b/c") == f"the SHA-256 of b/c {wrong}: the file is damaged"
 
 
 # torch

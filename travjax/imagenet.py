@@ -24,7 +24,15 @@ from travjax.files import user_path
 from travjax.flags import key_of
 from travjax.namings import CLASSES, Recognised, recognised
 from travjax.namings import NAMINGS as _NAMINGS
-from travjax.preprocessing import INPUTS, converted, has_statistics, is_untrained, require_fit, require_statistics
+from travjax.preprocessing import (
+    INPUTS,
+    converted,
+    has_statistics,
+    is_untrained,
+    require_fit,
+    require_kernel,
+    require_statistics,
+)
 from travjax.resnet import ResNet, ResNetConfig
 from travjax.stored_arrays import Stored, WeightFile, shown
 from travjax.weight_files import open_arrays, write_safetensors
@@ -182,6 +190,7 @@ def _canonical(
     ours: the file is one of `travjax weights`, whose input was looked for when it was made
     """
     names = {canonical: shown(name) for name, (canonical, _) in network.expected.items()}
+    require_kernel(arrays, names)
     if not (told or ours):
         require_statistics(arrays, names)
     measured = has_statistics(arrays)

@@ -196,12 +196,13 @@ def _sorted_out(
 
 
 def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], naming: Naming, top: dict) -> bool:
-    """Whether the top layer is one of another number of classes, or without a bias."""
+    """Whether the top layer is one of another number of classes, or without a bias for each of them."""
     kernel, bias = (found.get(in_file(name)) for name in top)
     if kernel is None or len(kernel.shape) != 2:
         return False
     features, classes = kernel.shape[::-1] if naming.by_output else kernel.shape
-    return features == top["fc1000/kernel"][0] and (classes != CLASSES or bias is None)
+    whole = classes == CLASSES and bias is not None and bias.shape == (CLASSES,)
+    return features == top["fc1000/kernel"][0] and not whole
 
 
 def _are_heads(shapes: list[tuple[int, ...]], features: int) -> bool:

@@ -34,9 +34,6 @@ resnet50_imagenet.npz, 0.05 for random numbers)."""
 FEWEST = 16
 """Filters that this takes."""
 
-FAR = 0.15
-"""Difference of means of colours, in the same units, from which on an input that was given is not believed."""
-
 NEAR = 0.06
 """Difference of means of colours, in units of (x / 255 - mean) / std; 0.04 in resnet50_imagenet.npz."""
 
@@ -66,6 +63,9 @@ INPUTS = {
     "unit": PixelInput("R, G, B, x / 255", STD.astype(np.float32), MEAN),
 }
 """By the names of Keras' preprocess_input where it has them; mean and std are those of ImageNet."""
+
+MEANS = ("torch", "tf", "unit")
+"""Inputs of values about 1, which their means tell apart."""
 
 CONVERT = "travjax weights --from FILE --input {} takes them as what they are"
 
@@ -116,15 +116,20 @@ def require_statistics(arrays: dict[str, np.ndarray], names: dict[str, str]) -> 
         )
 
 
+def require_kernel(arrays: dict[str, np.ndarray], names: dict[str, str]) -> None:
+    """Raises InputError for a first kernel of zeros, which no network has, not even one before training."""
+    if not arrays["conv1/kernel"].any():
+        raise InputError(f"{names['conv1/kernel']} = 0 throughout: must be the kernel of a network")
+
+
 def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, str]) -> None:
     """Raises InputError when the first layer of canonical arrays shows that they are made for another input.
 
     assumed: what they were converted from, one of INPUTS; names: in the file, by canonical name
     """
+    given = INPUTS[assumed]
     kernel, mean, var = (arrays[f"conv1/{kind}"].astype(np.float64) for kind in ("kernel", "mean", "var"))
     squares = (kernel**2).sum(axis=(0, 1, 2))
-    if not squares.any():
-        raise InputError(f"{names['conv1/kernel']} = 0 throughout: must be the kernel of a trained network")
     live = (squares > 0) & (arrays["conv1/gamma"] != 0)
     if not live.any():
         return
@@ -133,23 +138,33 @@ def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, st
         size = "larger" if ratio > MOST else "smaller"
         raise InputError(
             f"{names['conv1/var']} = {ratio:.2g} times the squares of {names['conv1/kernel']}, upper quartile: must be "
-            f"{LEAST} to {MOST:.0f}, as from {INPUTS[assumed].text}: made for {size} values; {_fitting(ratio, assumed)}"
+            f"{LEAST} to {MOST:.0f}, as from {given.text}: made for {size} values; {_fitting(ratio, assumed)}"
         )
     colours = _mean_of_colours(kernel[..., live], mean[live])
-    if colours is None:
-        return
-    # In a kernel that is taken for one of y, scale * y + offset has the mean `offset`.
-    meant = [name for name in ("tf", "unit") if np.abs(colours - INPUTS[name].offset).max() < NEAR]
-    if assumed.startswith("torch") and meant:
+    meant = None if colours is None else _meant(colours, assumed)
+    if meant:
         raise InputError(
-            f"{names['conv1/mean']} = what pixels of {INPUTS[meant[0]].text} give: must be of {INPUTS[assumed].text}; "
-            f"{CONVERT.format(meant[0])}, and --input {assumed} if that is wrong"
+            f"{names['conv1/mean']} = what pixels of {INPUTS[meant].text} give: must be of {given.text}; "
+            f"{CONVERT.format(meant)}"
         )
-    if INPUTS[assumed].offset.any() and np.abs(colours).max() > FAR:
-        raise InputError(
-            f"{names['conv1/mean']} = what pixels of another mean give than {INPUTS[assumed].text}: --input must be "
-            "another one, or be left out"
-        )
+
+
+def _meant(colours: np.ndarray, assumed: str) -> str | None:
+    """Which other input the mean of R, G and B tells, in units of (x / 255 - mean) / std as from `assumed`.
+
+    Images of a mean of their own are allowed: from "torch", only what is NEAR another input's mean is one; from "tf"
+    and "unit", whatever is nearer to another's than to theirs.
+    """
+    given = INPUTS[assumed]
+    own = "torch" if assumed == "torch-bgr" else assumed
+    if own not in MEANS:
+        return None
+    values = given.scale * colours + given.offset
+    orders = [values, values[::-1]] if given.reverse else [values]
+    away = {name: min(np.abs(order - INPUTS[name].offset).max() for order in orders) for name in MEANS}
+    nearest = min(away, key=lambda name: away[name])
+    told = nearest != own and (own != "torch" or away[nearest] < NEAR)
+    return nearest if told else None
 
 
 def _fitting(ratio: float, assumed: str) -> str:

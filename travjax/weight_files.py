@@ -46,12 +46,25 @@ def open_arrays(path: Path) -> Iterator[WeightFile]:
         exists, folder = path.is_file(), path.is_dir()
     if not exists:
         raise InputError("is a folder; allowed: a file" if folder else "no such file")
+    _require_content(path, suffix)
     with ExitStack() as held:
         file = READERS[suffix](path, held)
         counters = [name for name in file.arrays if name.endswith("num_batches_tracked")]
         for name in counters:
             del file.arrays[name]
         yield file
+
+
+def _require_content(path: Path, suffix: str) -> None:
+    """Raises InputError for what often lies where weights should: nothing, a pointer to them, a page of a server."""
+    with reading(suffix), path.open("rb") as file:
+        start = file.read(512)
+    if not start:
+        raise InputError("is empty: must be a file of weights")
+    if start.startswith(b"version https://git-lfs"):
+        raise InputError("is a Git LFS pointer: must be the file that it stands for, which git lfs pull fetches")
+    if start.removeprefix(b"\xef\xbb\xbf").lstrip().lower().startswith((b"<!doctype html", b"<html")):
+        raise InputError("is an HTML page: must be a file of weights; a download may have given an error or a login")
 
 
 def write_safetensors(path: Path, arrays: dict[str, np.ndarray], notes: dict) -> None:
@@ -111,7 +124,8 @@ def _safetensors(path: Path, held: ExitStack) -> WeightFile:
 
 def _require_sum(what: str, found: str, given: object) -> None:
     if found != given:
-        raise InputError(f"{what} = {found[:8]}... (SHA-256): must be {shown(str(given))[:8]}...: the file is damaged")
+        wrong = "is missing" if given is None else "is not the one that the file gives"
+        raise InputError(f"the SHA-256 of {what} {wrong}: the file is damaged")
 
 
 def _sum_of(array: np.ndarray) -> str:
