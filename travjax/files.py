@@ -259,7 +259,7 @@ def find_preset(given: str, experiment: str) -> Path:
 
     Raises InputError that lists the names when there is no such file.
     """
-    if Path(given).suffix == ".toml":
+    if Path(given).suffix.lower() == ".toml":
         if user_path(given).is_file():
             return user_path(given)
         raise InputError(f"preset {given}: no such file")

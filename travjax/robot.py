@@ -68,7 +68,7 @@ class Robot:
         """
         if isinstance(source, Robot):
             return source
-        if Path(source).suffix == ".toml":
+        if Path(source).suffix.lower() == ".toml":
             return load_toml(source, Robot)
         if str(source) not in Robot.presets():
             raise InputError(
