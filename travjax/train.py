@@ -120,9 +120,9 @@ class Trainer:
     def resume(self) -> None:
         """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
 
-        Raises InputError when there is none, or it was trained on another data set or with other settings.
+        Raises InputError when there is none, or it was trained on another data set.
         """
-        optimizer = lambda meta: checked_meta(meta, self.folder, self.run)["optimizer"]
+        optimizer = lambda meta: checked_meta(meta, self.folder)["optimizer"]
         template = lambda meta: self.run.template(optimizer(meta), self.devices.everywhere)
         self.state, meta = self.checkpoints.restore(template)
         trained_on, given = meta["dataset"], self.data.dataset.fingerprint

@@ -143,11 +143,11 @@ def has_checkpoints(folder: Path) -> bool:
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
 
-def checked_meta(meta: dict, folder: str | Path, run: Run) -> dict:
+def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict:
     """Returns what training said of a checkpoint of a run.
 
     Raises InputError that names the run's folder where it did not say it, and run.json where the checkpoint was trained
-    with other settings than those of `run`; older checkpoints do not say with which.
+    with other settings than those of `run`, if one is given; older checkpoints do not say with which.
     """
     where, told = f"{folder}: meta of a checkpoint", meta.get("position")
     position = told if isinstance(told, dict) else {}
@@ -157,7 +157,7 @@ def checked_meta(meta: dict, folder: str | Path, run: Run) -> dict:
     summed = all(type(position.get(name)) in (int, float) and abs(position[name]) < math.inf for name in SUMS)
     whole = counted and summed and position["phase"] in (1, 2) and len(position) == len(COUNTS + SUMS)
     require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
-    if "run" in meta:
+    if run and "run" in meta:
         try:
             trained = Run.from_json(meta["run"])
         except InputError as error:
