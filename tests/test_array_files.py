@@ -160,6 +160,22 @@ def test_a_nan_that_signals_is_unknown_without_a_warning(tmp_path):
     assert np.isnan(windows.heights).sum() == 1
 
 
+def test_heights_of_two_bytes_in_coarse_steps_are_refused(tmp_path):
+    np.save(tmp_path / "a.npy", (uneven(0, 17, 17) + 300).astype(np.float16))
+    assert refusal(tmp_path / "a.npy", cell_size=0.0625).startswith("heights = 300.25: is stored in steps of 0.25 m")
+
+
+@pytest.mark.parametrize("mark", [-9999, -32768, -32767])
+def test_a_mark_is_looked_for_among_the_numbers_as_they_are_stored(tmp_path, mark):
+    heights = np.full((17, 17), 9999, np.int16)  # 99.99 m
+    heights[3, 4] = mark
+    np.save(tmp_path / "a.npy", heights)
+    options = dict(cell_size=0.0625, height_scale=0.01)
+    assert refusal(tmp_path / "a.npy", **options).startswith(f"heights = {mark}, as stored: is a usual mark of unknown")
+    windows = load_dem(tmp_path / "a.npy", grid=SMALL, nodata=mark, fill_holes=False, **options)
+    assert np.isnan(windows.heights).sum() == 1
+
+
 def test_a_npy_of_another_name_and_an_npz_called_npy_are_read(tmp_path):
     np.save(tmp_path / "a.npy", uneven(0, 17, 17))
     (tmp_path / "a.npy").rename(tmp_path / "a.dat")

@@ -211,3 +211,9 @@ def test_everything_is_explained():
     for kind in (Site, SitesConfig, SiteRecord, Provenance):
         for field in fields(kind):
             assert field.name in kind.__doc__, field.name
+
+
+def test_a_site_whose_maps_have_heights_of_their_own_has_no_common_offset():
+    values = dict(name="a", file="a.npz", sha256="0", crs=None, cell_size=0.1, covered=1.0, filled=0.0, unknown=0.0)
+    counts = dict.fromkeys(("windows", "train", "validation", "test", "too_unknown", "near_test", "shared"), 1)
+    assert SiteRecord(**values, **counts, height_offset=None).height_offset is None

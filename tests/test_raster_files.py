@@ -185,6 +185,25 @@ def test_a_variable_of_a_netcdf_is_read_by_its_name(tmp_path):
     assert refusal(path, band="depth").startswith("band 1: has heights in units of 0.01 m (cm)")
 
 
+def test_a_raw_raster_that_is_cut_short_is_refused(tmp_path):
+    path = write(tmp_path / "a.img", driver="ENVI")
+    np.testing.assert_array_equal(read(path), HEIGHTS)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert refusal(path).startswith(f"bytes = {HEIGHTS.nbytes - 40}: must be at least {HEIGHTS.nbytes}")
+
+
+def test_depths_of_a_netcdf_are_refused(tmp_path):
+    path = write_netcdf(tmp_path / "a.nc", z=(HEIGHTS, "m"))
+    with h5py.File(path, "r+") as file:
+        file["z"].attrs["positive"] = "down"
+    assert refusal(path).startswith("band 1: holds depths, which run down")
+
+
+def test_a_name_that_is_no_utf8_is_one_line(tmp_path):
+    path = write(tmp_path / "a.tif").rename(os.fsdecode(os.fsencode(tmp_path) + b"/nam\xffe.tif"))
+    assert refusal(path) == "name: must be UTF-8, which GDAL wants; rename the file"
+
+
 def test_a_netcdf_in_degrees_is_refused_without_a_coordinate_system_too(tmp_path):
     with h5py.File(tmp_path / "a.nc", "w") as file:
         for name, first, count, unit in (("lat", 46.0, 20, "degrees_north"), ("lon", 7.0, 24, "degrees_east")):

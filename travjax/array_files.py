@@ -19,6 +19,7 @@ import numpy as np
 from travjax.config import InputError, require
 from travjax.coordinates import require_metric_named
 from travjax.dem_options import DemOptions
+from travjax.heights import require_close
 from travjax.memory import require_memory
 from travjax.raster import InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 
@@ -63,6 +64,8 @@ def rasters_of(entries: Entries, options: DemOptions, names: list[str] | None = 
         raise InputError(
             f"heights: {heights.dtype} {list(heights.shape)}: must be numbers [rows, cols] or [n, rows, cols]"
         )
+    if heights.dtype.itemsize == 2:
+        require_close(heights)
     maps = heights.reshape(-1, *heights.shape[-2:])
     each, cell_size = len(maps), options.cell_size
     if "cell_size" in entries:

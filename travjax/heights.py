@@ -41,7 +41,7 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     maps = heights.reshape(-1, *grid.shape)
     if isinstance(maps, np.ndarray):
         _require_ground(maps)
-        _require_fine(maps)
+        require_close(maps)
         if maps.dtype != np.float32:
             maps = _relative(maps.astype(np.float64), grid)
     elif maps.dtype == np.float64:
@@ -62,7 +62,7 @@ def _unmarked(maps: jax.Array) -> jax.Array:
     return jnp.where(marked, jnp.nan, heights)
 
 
-def _require_fine(maps: np.ndarray) -> None:
+def require_close(maps: np.ndarray) -> None:
     """Raises InputError for heights in a number type whose steps are coarse at that height: ground would be flat."""
     if maps.dtype.kind in "iu" or maps.dtype.itemsize > 2:
         return

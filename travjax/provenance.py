@@ -157,7 +157,8 @@ class SiteRecord:
             require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
         require(self.crs is None or isinstance(self.crs, str), "crs", self.crs, "a text, or none")
         for name in ("cell_size", "height_offset", "covered", "filled", "unknown"):
-            require_number(name, getattr(self, name), -math.inf, math.inf, "a number")
+            if name != "height_offset" or self.height_offset is not None:
+                require_number(name, getattr(self, name), -math.inf, math.inf, "a number")
         for name in ("windows", *SPLITS, "too_unknown", "near_test", "shared"):
             value = getattr(self, name)
             require(type(value) is int and 0 <= value < 2**63, name, value, "a whole number, at least 0")

@@ -19,6 +19,9 @@ COARSEST = 0.125
 LOWEST = -12_000.0
 """Metres: what is deeper is no height; HIGHEST is in grid.py."""
 
+STORED_MARKERS = (-9999, -99999, -32768, -32767)
+"""The same among numbers that are scaled to metres, in which 9999 may well be a height."""
+
 PART = 2**22
 """Cells of a raster that are in memory at once while it is read through: 32 MiB."""
 
@@ -98,6 +101,13 @@ class InMetres:
             heights[self._unknown[part]] = np.nan
         if self._nodata is not None:
             heights[values == self._nodata] = np.nan
+        if self._scale != 1 or self._offset:
+            marked = np.isin(values, STORED_MARKERS) & ~np.isnan(heights)
+            for bad in values[marked][:1].tolist():
+                raise InputError(
+                    f"heights = {bad:g}, as stored: is a usual mark of unknown ground, not declared as such; "
+                    "if it marks unknown ground, say so (--nodata=VALUE)"
+                )
         return heights
 
 

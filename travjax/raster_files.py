@@ -21,7 +21,7 @@ from travjax.formats import OTHERS
 from travjax.memory import require_memory
 from travjax.raster import HeightSource, InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 
-PICTURES = ("BMP", "GIF", "BIGGIF", "JP2OpenJPEG", "JPEG", "PNG", "PNM", "SGI", "TGA", "WEBP")
+PICTURES = ("BMP", "GIF", "BIGGIF", "JP2OpenJPEG", "JPEG", "PNG", "PNM", "SGI", "WEBP")
 """Drivers of pictures, which hold no metres; most are read from the first row on, so they are read at once."""
 
 DRIVERS = (
@@ -53,6 +53,8 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
     and, without rotation, north or south.
     """
     _require_closed(path)
+    if not str(path).isprintable() and any("\ud800" <= letter <= "\udfff" for letter in str(path)):
+        raise InputError("name: must be UTF-8, which GDAL wants; rename the file")
     with _gdal():
         file, placed = _opened(str(path.absolute()), (*DRIVERS, *options.gdal_drivers))
         if not file.count and file.subdatasets:
@@ -61,6 +63,7 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
         dtype = np.dtype(file.dtypes[band - 1])
         if not is_real(dtype):
             raise InputError(f"heights: {dtype}: must be numbers")
+        _require_whole(path, file)
         _require_metres(file, band, placed, options)
         _require_no_degrees(file)
         crs = parsed(file.crs.to_wkt()) if file.crs else None
@@ -134,7 +137,7 @@ def _opened(name: str, drivers: tuple[str, ...]) -> tuple[Any, bool]:
 def _require_closed(path: Path) -> None:
     """Refuses a file whose pixels lie elsewhere, or beside which lies something that GDAL would open as well."""
     for name in {f"{path}{suffix}" for suffix in SIDECARS} | {str(path.with_suffix(suffix)) for suffix in SIDECARS}:
-        if os.path.exists(name) and name != str(path):
+        if os.path.isfile(name) and name != str(path):
             with open(name, "rb") as file:
                 if not file.read(4).startswith(TIFF):
                     raise InputError(f"{name} beside it: must be a TIFF, or not be there: GDAL would open it")
@@ -280,7 +283,17 @@ def _require_metres(file: Any, band: int, placed: bool, options: DemOptions) -> 
     if not scaled and (file.driver in PICTURES or bare or grey):
         what = f"a {file.driver}" if not bare else "a TIFF without a place on the ground"
         raise InputError(f"height_scale is missing: {what} holds no metres; give it (--height-scale METRES)")
+    tags = file.tags(band)
+    if tags.get("positive") == "down" or "depth" in tags.get("standard_name", ""):
+        raise InputError(f"band {band}: holds depths, which run down; turn them into heights first")
     require_height_unit_named(f"band {band}", file.units[band - 1], scaled)
+
+
+def _require_whole(path: Path, file: Any) -> None:
+    """Refuses a raw raster that is cut short: GDAL reads what is missing as 0."""
+    if file.driver == "ENVI":
+        size = file.height * file.width * sum(np.dtype(kind).itemsize for kind in file.dtypes)
+        require(path.stat().st_size >= size, "bytes", path.stat().st_size, f"at least {size}, as its header says")
 
 
 def _require_no_degrees(file: Any) -> None:

@@ -112,7 +112,10 @@ def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
 
 
 def _codes(text: str) -> tuple[int, ...]:
-    return tuple(int(code) for code in text.split(","))
+    try:
+        return tuple(int(code) for code in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: must be codes from 0 to 255, as in 2,9") from None
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
