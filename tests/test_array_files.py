@@ -183,3 +183,15 @@ def test_a_npy_of_another_name_and_an_npz_called_npy_are_read(tmp_path):
     (tmp_path / "b.npz").rename(tmp_path / "b.npy")
     first, second = load_dem(tmp_path / "a.dat", grid=SMALL, cell_size=0.0625), load_dem(tmp_path / "b.npy", grid=SMALL)
     np.testing.assert_array_equal(first.heights, second.heights)
+
+
+@pytest.mark.parametrize("digits", [4, 5])
+def test_a_lattice_of_points_that_jitter_by_half_a_millimetre_keeps_a_kerb(tmp_path, digits):
+    x, y = np.meshgrid(np.arange(33) * 0.0625, np.arange(33) * 0.0625)
+    random = np.random.default_rng(0)
+    moved = [(axis + random.uniform(-5e-4, 5e-4, axis.shape)).ravel() for axis in (x, y)]
+    points = np.stack([*moved, np.where(x > 1, 0.15, 0).ravel()], axis=1)
+    np.savetxt(tmp_path / "a.xyz", points, fmt=f"%.{digits}f")
+    windows = load_dem(tmp_path / "a.xyz", grid=Grid(2.0, 0.0625))
+    assert windows.cell_size == 0.0625
+    assert np.abs(np.diff(windows.heights[0], axis=1)).max() == pytest.approx(0.15, abs=1e-6)

@@ -27,8 +27,8 @@ ON_NODES = 0.75
 OFF_NODE = 0.3
 """Share of a lattice's step that rounding may move a column or row by."""
 
-SAME_LEVEL = 1e-4
-"""Metres: coordinates that are nearer than that are the same with another rounding."""
+SAME_LEVEL = 1.5e-4
+"""Metres: coordinates that are nearer than that are the same with another rounding; text often has four decimals."""
 
 LEAST_KNOWN = 1e-3
 """Share of the cells that there must be points for."""
