@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from travjax import cli
-from travjax.actions import ActionSpace
+from travjax.simulation.actions import ActionSpace
 
 FEW = ActionSpace(turns=2, arc_lengths=(0.5, 0.6), radii=(math.inf, 1.5, -1.5), interval=0.1)
 FEW_TOML = "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n"

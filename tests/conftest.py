@@ -16,12 +16,12 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
-from commandline import FEW_TOML
 
-from travjax.actions import ActionSpace
-from travjax.grid import Grid
-from travjax.robot import Robot
-from travjax.terrain import STYLES, generate_terrain
+from tests.commandline import FEW_TOML
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.terrain.styles import STYLES, generate_terrain
 
 # A runner in the background ignores interrupts, and so would the programs that tests start and interrupt.
 if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
@@ -170,7 +170,7 @@ def few(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def shared_code() -> Iterator[None]:
     """Trainers of the same settings of the optimizer share compiled code."""
-    from travjax.preset import TrainingConfig
+    from travjax.runs.preset import TrainingConfig
 
     make, made = TrainingConfig.optimizer, {}
 
@@ -189,7 +189,7 @@ def shared_code() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory, few, shared_code) -> Path:
     """The folder of a finished run of `travjax train`; beside it are `set`, `tiny.toml`, `out.txt` and `err.txt`."""
-    from training import files_of_run, train, words_of
+    from tests.small_training import files_of_run, train, words_of
 
     folder = tmp_path_factory.mktemp("trained")
     with cache_in(folder / "cache"):

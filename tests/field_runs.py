@@ -6,16 +6,16 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from commandline import FEW
-from training import GRID, HUSKY, dataset
 
-from travjax.corruption import CorruptionConfig
-from travjax.estimator import put_together, take_apart
-from travjax.field import FieldConfig, HazardField, create
-from travjax.parallel import Devices
-from travjax.preset import EvaluationConfig, Preset, TrainingConfig
-from travjax.train_field import FieldTrainer
-from travjax.trained import Run
+from tests.commandline import FEW
+from tests.small_training import GRID, HUSKY, dataset
+from travjax.data.sensor_noise import CorruptionConfig
+from travjax.devices import Devices
+from travjax.models.hazard_field import FieldConfig, HazardField, create
+from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
+from travjax.runs.run import Run
+from travjax.training.map_training import FieldTrainer
 
 CONFIG = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, momentum=0.5)
 

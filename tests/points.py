@@ -10,12 +10,12 @@ import plyfile
 import pytest
 import trimesh
 
-from travjax.clouds import read_cloud
 from travjax.config import InputError
-from travjax.dem import load_dem
-from travjax.dem_options import DemOptions
-from travjax.grid import Grid
-from travjax.raster import Raster
+from travjax.data.dem import load_dem
+from travjax.point_clouds.clouds import read_cloud
+from travjax.rasters.raster import Raster
+from travjax.rasters.reading_options import DemOptions
+from travjax.simulation.grid import Grid
 
 
 def points_of(heights: np.ndarray, cell: float, west: float = 0.0, south: float = 0.0) -> np.ndarray:

@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 import rasterio
 from affine import Affine
-from commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 from PIL import Image
 
 import travjax
-from travjax import cli, labelling
-from travjax.actions import ActionSpace
+from tests.commandline import FEW, Run, files, printed_files, run, run_words, succeeds
+from travjax import cli
 from travjax.commands import label as label_command
-from travjax.grid import Grid
-from travjax.report import shares_table
-from travjax.robot import Robot
-from travjax.terrain import FIELDS
+from travjax.data import map_batches
+from travjax.evaluation.tables import shares_table
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.terrain.styles import FIELDS
 
 CELL = 0.0625
 SEEKUR_JR = Robot.load("seekur_jr")
@@ -399,7 +400,7 @@ def test_up_to_five_maps_are_shown_each_once_and_from_as_many_groups_as_can_be(g
         "failed": np.repeat((np.arange(100) < 100 * rates[:, None])[..., None], 3, axis=-1),
         "known": np.ones((groups * count, 100), bool),
     }
-    chosen = labelling.samples(maps)
+    chosen = map_batches.samples(maps)
     assert len(set(chosen.tolist())) == len(chosen)
     assert 1 <= len(chosen) <= 5
     assert len(set(maps["group"][chosen])) == min(groups, 5)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import jax
 import pytest
-from conftest import cache_in
 
+from tests.conftest import cache_in
 from travjax import entry
 from travjax.config import InputError, naming
 from travjax.signals import Terminated

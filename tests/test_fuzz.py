@@ -7,10 +7,11 @@ import zipfile
 
 import numpy as np
 import pytest
-from fuzz import campaign, faults
-from fuzz.formats import FORMATS
-from fuzz.mutations import KINDS, mutated
-from fuzz.worker import ACCEPTED, FAILED, REFUSED
+
+from tests.fuzz import campaign, faults
+from tests.fuzz.formats import FORMATS
+from tests.fuzz.mutations import KINDS, mutated
+from tests.fuzz.worker import ACCEPTED, FAILED, REFUSED
 
 CASES = 10
 """Of each format; `python -m tests.fuzz --case FORMAT:SEED` repeats one."""
@@ -43,7 +44,7 @@ def test_the_short_campaign_gets_past_what_reads_a_file_first(findings):
 def caught() -> dict[str, campaign.Finding]:
     """One case of each reader of faults.py that accepts its seed, but for the one that hangs."""
     names = [name for name in faults.FORMATS if name not in ("hangs", "refuses all")]
-    found = campaign.run([(name, 0) for name in names], names, module="fuzz.faults")
+    found = campaign.run([(name, 0) for name in names], names, module="tests.fuzz.faults")
     return {finding.case[0]: finding for finding in found}
 
 
@@ -72,7 +73,7 @@ def test_what_is_valid_or_refused_in_one_line_is_no_fault(caught):
 
 def test_a_process_that_hangs_is_ended_and_its_files_are_kept(tmp_path):
     cases = [("hangs", 0), ("hangs", 1)]
-    found = campaign.run(cases, ["hangs"], workers=1, module="fuzz.faults", patience=1, keep=tmp_path)
+    found = campaign.run(cases, ["hangs"], workers=1, module="tests.fuzz.faults", patience=1, keep=tmp_path)
     assert [finding.case for finding in found] == cases
     for finding in found:
         assert finding.result == FAILED and finding.message == "no answer within 1 s"
@@ -81,7 +82,7 @@ def test_a_process_that_hangs_is_ended_and_its_files_are_kept(tmp_path):
 
 def test_a_seed_that_its_reader_refuses_is_an_error_of_the_table():
     with pytest.raises(RuntimeError, match="refuses all: an undamaged file is not accepted: .*: no file of ours"):
-        campaign.run([], ["refuses all"], module="fuzz.faults")
+        campaign.run([], ["refuses all"], module="tests.fuzz.faults")
 
 
 # ---- Damage

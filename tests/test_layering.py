@@ -1,4 +1,4 @@
-"""A module of travjax imports only modules below it."""
+"""A module of travjax imports only modules below it: of a package further down, or of its own further down."""
 
 import ast
 from pathlib import Path
@@ -7,115 +7,35 @@ import pytest
 
 import travjax
 
-ORDER = [
-    "config",
-    "models",
-    "signals",
-    "locks",
-    "flags",
-    "rounding",
-    "files",
-    "progress",
-    "arrays",
-    "grid",
-    "heights",
-    "batching",
-    "noise",
-    "terrain",
-    "robot",
-    "actions",
-    "footprint",
-    "traverse",
-    "reference",
-    "inputs",
-    "memory",
-    "npz_stream",
-    "coordinates",
-    "dem_options",
-    "formats",
-    "raster",
-    "raster_files",
-    "array_files",
-    "points",
-    "gridding",
-    "text_points",
-    "geokeys",
-    "laz",
-    "las",
-    "ply",
-    "pcd",
-    "meshes",
-    "clouds",
-    "holes",
-    "surface",
-    "dem",
-    "labelling",
-    "sampling",
-    "provenance",
-    "dataset_json",
-    "dataset",
-    "sites",
-    "tfds_builder",
-    "convolution",
-    "resnet",
-    "stored_arrays",
-    "keras_files",
-    "weight_files",
-    "namings",
-    "preprocessing",
-    "imagenet",
-    "estimator",
-    "stencil",
-    "corruption",
-    "field",
-    "checkpoint",
-    "metrics",
-    "parallel",
-    "preset",
-    "map_data",
-    "prediction",
-    "runlog",
-    "trained",
-    "training_data",
-    "training_step",
-    "train",
-    "train_field",
-    "baselines",
-    "evaluate",
-    "model_file",
-    "predictor",
-    "robustness",
-    "transfer",
-    "plots",
-    "report",
-    "transfer_scores",
-    "robustness_scores",
-    "curves",
-    "statistics",
-    "bench",
-    "bench_network",
-    "commands.options",
-    "commands.terrain",
-    "commands.label",
-    "commands.dataset",
-    "commands.weights",
-    "commands.train",
-    "commands.evaluate",
-    "commands.export",
-    "commands.predict",
-    "commands.bench",
-    "entry",
-    "cli",
-    "experiments.launch",
-    "experiments.transfer",
-    "experiments.synthetic",
-    "experiments.timing",
-    "experiments.comparison",
-]
-"""From the bottom to the top; __init__ and __main__ may import any of them."""
+LAYERS = {
+    "": "config signals locks files progress jax_flags batching devices entry",
+    "simulation": "arrays grid heights robot actions footprint traverse reference",
+    "terrain": "noise styles",
+    "rasters": "coordinates reading_options memory formats raster gdal_files array_files holes surface",
+    "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
+    "data": "dem map_batches npz_stream sensor_noise sampling provenance dataset_json dataset sites tfds_export",
+    "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights",
+    "models": "names input_images trajectory_resnet pose_stencil hazard_field",
+    "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
+    "simulator_benchmark",
+    "runs": "checkpoint preset map_samples inference run_log run model_file predictor",
+    "training": "trajectory_samples step trainer map_training evaluator network_benchmark",
+    "commands": "options terrain label dataset weights train evaluate export predict bench",
+    "experiments": "launch transfer_runs robustness robustness_scores synthetic transfer timing comparison",
+    "program": "cli",
+}
+"""Packages from the bottom to the top, "" and "program" being travjax itself; in each, its modules likewise."""
 
-FREE = ["__init__", "__main__", "commands.__init__", "experiments.__init__"]
-PACKAGES = ["travjax", "travjax.commands", "travjax.experiments"]
+MOST = 10
+"""Modules in a package."""
+
+ORDER = [
+    f"{package}.{module}" if package not in ("", "program") else module
+    for package, modules in LAYERS.items()
+    for module in modules.split()
+]
+FREE = ["__init__", "__main__", *(f"{package}.__init__" for package in LAYERS if package not in ("", "program"))]
+PACKAGES = ["travjax", *(f"travjax.{package}" for package in LAYERS if package)]
 PACKAGE = Path(travjax.__file__).parent
 MODULES = sorted(".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py"))
 
@@ -137,15 +57,15 @@ def imports_of(source: str) -> set[str]:
     [
         ("import numpy", set()),
         ("import travjax", {""}),
-        ("import travjax.grid as g", {"grid"}),
-        ("from travjax import grid, noise", {"grid", "noise"}),
-        ("from travjax.grid import Grid", {"grid"}),
-        ("from .grid import Grid", {"grid"}),
-        ("from . import grid", {"grid"}),
-        ("def f():\n    from travjax.grid import Grid", {"grid"}),
-        ("if TYPE_CHECKING:\n    import travjax.grid", {"grid"}),
-        ("from travjax.commands import label, options", {"commands.label", "commands.options"}),
-        ("from travjax.commands.options import seed", {"commands.options"}),
+        ("import travjax.config as c", {"config"}),
+        ("from travjax import config, files", {"config", "files"}),
+        ("from travjax.config import require", {"config"}),
+        ("from .config import require", {"config"}),
+        ("from . import config", {"config"}),
+        ("def f():\n    from travjax.config import require", {"config"}),
+        ("if TYPE_CHECKING:\n    import travjax.config", {"config"}),
+        ("from travjax.simulation import grid, robot", {"simulation.grid", "simulation.robot"}),
+        ("from travjax.simulation.grid import Grid", {"simulation.grid"}),
         ("import travjaxes", set()),
     ],
 )
@@ -165,9 +85,14 @@ def test_a_module_imports_only_modules_below_it(module):
     assert imports_of((PACKAGE / f"{module.replace('.', '/')}.py").read_text()) <= {*below, *package}
 
 
+@pytest.mark.parametrize("package", LAYERS)
+def test_a_package_can_be_taken_in_at_a_glance(package):
+    assert len(LAYERS[package].split()) <= MOST
+
+
 def test_the_sequential_simulator_shares_no_code_with_the_package():
-    assert imports_of((PACKAGE / "reference.py").read_text()) == set()
+    assert imports_of((PACKAGE / "simulation/reference.py").read_text()) == set()
 
 
 def test_modules_are_found_at_all():
-    assert {"config", "reference", "traverse", "__init__"} <= set(MODULES)
+    assert {"config", "simulation.reference", "simulation.traverse", "__init__"} <= set(MODULES)

@@ -3,8 +3,7 @@
 import io
 import sys
 
-from commandline import Terminal
-
+from tests.commandline import Terminal
 from travjax import progress
 
 

@@ -10,21 +10,21 @@ from copy import deepcopy
 from typing import Any
 
 import pytest
-from test_dataset import placed_maps
-from training import run_of
 
-from travjax import dataset_json
-from travjax.actions import ActionSpace
+from tests.data.test_dataset import placed_maps
+from tests.small_training import run_of
 from travjax.config import InputError, from_json, to_json
-from travjax.dataset import Dataset, is_dataset, load, save
-from travjax.grid import Grid
-from travjax.preset import Preset, TrainingConfig
-from travjax.provenance import SiteRecord, SitesConfig
-from travjax.robot import Robot
-from travjax.statistics import statistics_table, windows_table
-from travjax.trained import Run, checked_meta
-from travjax.transfer import TransferConfig
-from travjax.transfer_scores import Epoch
+from travjax.data import dataset_json
+from travjax.data.dataset import Dataset, is_dataset, load, save
+from travjax.data.provenance import SiteRecord, SitesConfig
+from travjax.evaluation.dataset_tables import statistics_table, windows_table
+from travjax.evaluation.transfer_scores import Epoch
+from travjax.experiments.transfer_runs import TransferConfig
+from travjax.runs.preset import Preset, TrainingConfig
+from travjax.runs.run import Run, checked_meta
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
 
 PLACED = placed_maps()
 PROVENANCE = PLACED.provenance

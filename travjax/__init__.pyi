@@ -1,14 +1,14 @@
 """The public names and where they come from; __init__.py reads this file."""
 
-from .actions import ActionSpace
 from .config import InputError
-from .dem import load_dem
-from .grid import Grid
-from .inputs import render_inputs
-from .predictor import predict
-from .robot import Robot
-from .terrain import STYLES, TerrainParams, elevation, generate_terrain, sample_params
-from .traverse import EVENTS, Margins, failures, label, simulate
+from .data.dem import load_dem
+from .models.input_images import render_inputs
+from .runs.predictor import predict
+from .simulation.actions import ActionSpace
+from .simulation.grid import Grid
+from .simulation.robot import Robot
+from .simulation.traverse import EVENTS, Margins, failures, label, simulate
+from .terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 
 __version__: str
 

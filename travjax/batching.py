@@ -1,10 +1,13 @@
-"""Work on many maps in batches of a few fixed sizes, so that few shapes are compiled."""
+"""Work on many maps in batches: of a few fixed sizes, so that few shapes are compiled, and with results that do not
+depend on the batch.
+"""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 BATCH = 32
 """Maps worked on at once: more gains nothing on a CPU and costs memory."""
@@ -28,3 +31,13 @@ def in_batches(function: Callable[[Any], Any], items: Any) -> Any:
 
 def _filled(item: jax.Array, missing: int) -> jax.Array:
     return jnp.concatenate([item, jnp.repeat(item[:1], missing, axis=0)]) if missing else item
+
+
+def rounded(product: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """Returns a product that is rounded before it is added to something.
+
+    XLA repeats cheap expressions in several loops and joins multiply and add in some of them only, and where two
+    products are added it joins either; the last bits would then hang on the form of the loop.
+    The bound is never reached, which no optimiser knows.
+    """
+    return jnp.maximum(product, -1e30)

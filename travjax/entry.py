@@ -58,7 +58,7 @@ def guarded(work: Callable[[], object]) -> int:
     settle_streams()
     with signals.raised():
         try:
-            from travjax.flags import usual_flags  # imports JAX, which takes a second
+            from travjax.jax_flags import usual_flags  # imports JAX, which takes a second
 
             with usual_flags():
                 work()

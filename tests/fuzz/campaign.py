@@ -16,9 +16,9 @@ from pathlib import Path
 
 from .worker import ACCEPTED, FAILED, noise_of
 
-TESTS = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 
-FORMATS = "fuzz.formats"
+FORMATS = "tests.fuzz.formats"
 """The module with the table of formats."""
 
 PATIENCE = 120
@@ -163,8 +163,8 @@ class Worker:
 
     def _start(self) -> subprocess.Popen:
         words = [self.module, str(self.place / "seeds"), str(self.place / "work")]
-        code = f"from fuzz.worker import main; main(*{words!r})"
-        paths = [str(TESTS), str(TESTS.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+        code = f"from tests.fuzz.worker import main; main(*{words!r})"
+        paths = [str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
         self._process = subprocess.Popen(
             [sys.executable, "-c", code],
             stdin=subprocess.PIPE,

@@ -16,24 +16,24 @@ from pathlib import Path
 
 import jax
 import numpy as np
-from field_runs import RUN
-from points import CLOUDS, MESHES, points_of, write_las, write_ply, write_text
-from test_imagenet import NARROW, canonical_arrays, keras_arrays, torchvision_arrays, write
 
-from travjax.actions import ActionSpace
-from travjax.checkpoint import Checkpoints, load_meta
-from travjax.dataset import Dataset, DatasetConfig, load, save
-from travjax.dem import load_dem
-from travjax.estimator import put_together, take_apart
-from travjax.grid import Grid
-from travjax.imagenet import load_weights
-from travjax.model_file import read_model, write_model
-from travjax.preset import Preset
-from travjax.provenance import Provenance, Site, SiteRecord, SitesConfig
-from travjax.robot import Robot
-from travjax.runlog import read_rows
-from travjax.train import Position
-from travjax.trained import Run, load_estimator
+from tests.field_runs import RUN
+from tests.points import CLOUDS, MESHES, points_of, write_las, write_ply, write_text
+from tests.resnet.test_imagenet_weights import NARROW, canonical_arrays, keras_arrays, torchvision_arrays, write
+from travjax.data.dataset import Dataset, DatasetConfig, load, save
+from travjax.data.dem import load_dem
+from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
+from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.resnet.imagenet_weights import load_weights
+from travjax.runs.checkpoint import Checkpoints, load_meta
+from travjax.runs.model_file import read_model, write_model
+from travjax.runs.preset import Preset
+from travjax.runs.run import Run, load_estimator
+from travjax.runs.run_log import read_rows
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.training.trainer import Position
 
 from .worker import Format, Invalid
 

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import jax
 
-from travjax import progress, report
-from travjax.actions import ActionSpace
+from travjax import progress
 from travjax.commands import options
 from travjax.config import require
+from travjax.evaluation import tables
 from travjax.files import output_folder, written_whole
-from travjax.grid import Grid
-from travjax.robot import Robot
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
 
 
 def add(commands: options.Commands) -> None:
@@ -45,41 +46,41 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _measure_network(arguments: argparse.Namespace, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    from travjax import bench_network
+    from travjax.training import network_benchmark
 
     out = output_folder(arguments.out)
-    rows = bench_network.Bench(robot, actions, grid, arguments.repeats).rows()
-    measured = bench_network.with_ratio(list(progress.bar("network", 4, "row", iterable=rows)))
-    _write(measured, bench_network.COLUMNS, out / "network.tsv")
+    rows = network_benchmark.Bench(robot, actions, grid, arguments.repeats).rows()
+    measured = network_benchmark.with_ratio(list(progress.bar("network", 4, "row", iterable=rows)))
+    _write(measured, network_benchmark.COLUMNS, out / "network.tsv")
 
 
 def _write(rows: list[dict], columns: dict[str, str], path: Path) -> None:
     """Prints the table and writes it."""
-    from travjax import bench
+    from travjax.evaluation import simulator_benchmark
 
-    print(f"\n{bench.machine()}\n{report.rows_table(rows, columns)}\n")
+    print(f"\n{simulator_benchmark.machine()}\n{tables.rows_table(rows, columns)}\n")
     with written_whole(path) as temporary:
-        bench.write_tsv(rows, temporary, columns)
+        simulator_benchmark.write_tsv(rows, temporary, columns)
     progress.wrote(path)
 
 
 def _measure_labelling(arguments: argparse.Namespace, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    from travjax import bench, plots
+    from travjax.evaluation import map_figures, simulator_benchmark
 
-    bench.check(robot, actions, grid)
+    simulator_benchmark.check(robot, actions, grid)
     require(arguments.stream >= 0, "--stream", arguments.stream, "at least 0")
     out = output_folder(arguments.out)
-    rows = [bench.start_row()]
+    rows = [simulator_benchmark.start_row()]
     # First calls are to compile, not to read the cache.
     jax.config.update("jax_enable_compilation_cache", False)
-    measured = bench.kernel_rows(robot, actions, grid, arguments.repeats)
-    rows += list(progress.bar("kernels", 2 * len(bench.BATCHES), "row", iterable=measured))
+    measured = simulator_benchmark.kernel_rows(robot, actions, grid, arguments.repeats)
+    rows += list(progress.bar("kernels", 2 * len(simulator_benchmark.BATCHES), "row", iterable=measured))
     with progress.bar("sequential simulator", len(actions), "trajectory") as bar:
-        rows.append(bench.reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
+        rows.append(simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
     if arguments.stream:
         with progress.bar("stream", arguments.stream, "map") as bar:
-            rows.append(bench.stream_row(arguments.stream, robot, actions, grid, bar.update))
-    rows = bench.with_speed_up(rows)
-    _write(rows, bench.COLUMNS, out / "bench.tsv")
+            rows.append(simulator_benchmark.stream_row(arguments.stream, robot, actions, grid, bar.update))
+    rows = simulator_benchmark.with_speed_up(rows)
+    _write(rows, simulator_benchmark.COLUMNS, out / "bench.tsv")
     kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
-    progress.wrote(plots.save(plots.speed_figure(kernels), out / "bench.png"))
+    progress.wrote(map_figures.save(map_figures.speed_figure(kernels), out / "bench.png"))

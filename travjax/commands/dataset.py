@@ -6,17 +6,19 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from travjax import progress, sites, tfds_builder, traverse
-from travjax.actions import ActionSpace
+from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, one_line, require
-from travjax.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
-from travjax.dem_options import DemOptions
+from travjax.data import sites, tfds_export
+from travjax.data.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
+from travjax.data.provenance import SIDES, Site, SitesConfig, Strip
+from travjax.evaluation.dataset_tables import COLUMNS, statistics_table, windows_table
 from travjax.files import first_lines, output_folder, put_back, require_replaceable, resolved, save_text, user_path
-from travjax.grid import Grid
-from travjax.provenance import SIDES, Site, SitesConfig, Strip
-from travjax.robot import Robot
-from travjax.statistics import COLUMNS, statistics_table, windows_table
+from travjax.rasters.reading_options import DemOptions
+from travjax.simulation import traverse
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
 
 SYNTHETIC = ("maps", "seed", "validation", "test", "world")
 """The options of a synthetic data set."""
@@ -111,7 +113,7 @@ def run(arguments: argparse.Namespace) -> None:
         progress.wrote(folder, save_text(statistics, "\n\n".join(tables) + "\n"))
     if arguments.tfds:
         with progress.bar("exporting", len(dataset.split), "map") as bar:
-            tfds_builder.export(dataset, arguments.tfds, bar.update)
+            tfds_export.export(dataset, arguments.tfds, bar.update)
         progress.wrote(arguments.tfds)
 
 

@@ -16,10 +16,10 @@ from travjax.files import output_folder, save_text, user_path
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from travjax.evaluate import Evaluator
-    from travjax.metrics import Evaluation
-    from travjax.sampling import Samples
-    from travjax.trained import Network
+    from travjax.data.sampling import Samples
+    from travjax.evaluation.metrics import Evaluation
+    from travjax.runs.run import Network
+    from travjax.training.evaluator import Evaluator
 
 RECALLS = (0.9, 0.99)
 """Recalls that thresholds are found for, unless others are asked for."""
@@ -101,11 +101,11 @@ def evaluate(
     baselines:  whether the predictors to beat are evaluated as well
     Raises InputError when the run, its checkpoint or its data set is missing, damaged, or does not fit.
     """
-    from travjax import dataset
-    from travjax.evaluate import Evaluator
-    from travjax.field import HazardField
-    from travjax.parallel import Devices
-    from travjax.trained import DATA, load_estimator
+    from travjax.data import dataset
+    from travjax.devices import Devices
+    from travjax.models.hazard_field import HazardField
+    from travjax.runs.run import DATA, load_estimator
+    from travjax.training.evaluator import Evaluator
 
     trained, estimator, meta = load_estimator(folder, checkpoint)
     evaluator = Evaluator.of(trained, dataset.load(data or folder / DATA), Devices.all())
@@ -136,7 +136,7 @@ def _baselines(
     folder: Path, evaluator: "Evaluator", samples: "Samples", recalls: Sequence[float]
 ) -> dict[str, "Evaluation"]:
     """Evaluations of the predictors to beat: heads on the trunk as it was, and a regression on the ground alone."""
-    from travjax.trained import load_estimator
+    from travjax.runs.run import load_estimator
 
     others = {}
     if evaluator.run.preset.training.head_epochs:
@@ -173,25 +173,25 @@ def _write_tables(
     evaluator: "Evaluator",
     errors: np.ndarray | None,
 ) -> None:
-    from travjax import report
-    from travjax.metrics import to_json
-    from travjax.traverse import EVENTS
+    from travjax.evaluation import tables
+    from travjax.evaluation.metrics import to_json
+    from travjax.simulation.traverse import EVENTS
 
     paper = evaluator.paper
     average_precisions = {"network": scores.average_precision}
     average_precisions |= {name: other.average_precision for name, other in others.items()}
     headline = "{samples} samples of {maps} of {test_maps} test maps, {robot}; checkpoint {checkpoint}: phase {phase}, "
-    tables = [
+    parts = [
         (headline + "step {steps}").format(**description),
-        report.metrics_table(scores, paper),
-        report.threshold_table(scores, paper),
-        report.calibration_line(scores),
-        report.groups_table(scores),
-        report.baselines_table(average_precisions),
+        tables.metrics_table(scores, paper),
+        tables.threshold_table(scores, paper),
+        tables.calibration_line(scores),
+        tables.groups_table(scores),
+        tables.baselines_table(average_precisions),
     ]
     if errors is not None:
-        tables += [f"{MARGINS.capitalize()}:\n{report.metrics_table(others[MARGINS], paper)}", _margin_errors(errors)]
-    text = "\n\n".join(tables)
+        parts += [f"{MARGINS.capitalize()}:\n{tables.metrics_table(others[MARGINS], paper)}", _margin_errors(errors)]
+    text = "\n\n".join(parts)
     print(f"\n{text}\n")
     results = {"sample": description, "network": to_json(scores)}
     results |= {name: to_json(other) for name, other in others.items()}
@@ -203,7 +203,7 @@ def _write_tables(
 
 def _margin_errors(errors: np.ndarray) -> str:
     """One line on mean absolute errors [3]."""
-    from travjax.training_step import LARGE_MARGIN
+    from travjax.training.step import LARGE_MARGIN
 
     step, obstacle, tilt = errors
     return (
@@ -221,13 +221,13 @@ def _draw(
     maps: int,
     samples: int,
 ) -> None:
-    from travjax import curves, plots
+    from travjax.evaluation import map_figures, score_figures
 
-    figure = curves.precision_recall_figure(scores, evaluator.paper, others)
-    progress.wrote(plots.save(figure, out / "precision_recall.png"))
-    progress.wrote(plots.save(curves.reliability_figure(scores), out / "reliability.png"))
+    figure = score_figures.precision_recall_figure(scores, evaluator.paper, others)
+    progress.wrote(map_figures.save(figure, out / "precision_recall.png"))
+    progress.wrote(map_figures.save(score_figures.reliability_figure(scores), out / "reliability.png"))
     if maps:
-        progress.wrote(plots.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
+        progress.wrote(map_figures.save(_predictions(evaluator, estimator, maps, samples), out / "predictions.png"))
 
 
 def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, samples: int) -> "Figure":
@@ -235,8 +235,8 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, sample
 
     samples: those that were evaluated; where they are few, not all trajectories are shown
     """
-    from travjax import plots
-    from travjax.traverse import unpacked
+    from travjax.evaluation import map_figures
+    from travjax.simulation.traverse import unpacked
 
     data, trained = evaluator.dataset, evaluator.run
     shown = evaluator.to_show(maps)
@@ -246,7 +246,7 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, sample
         probability = evaluator.whole_maps(estimator, shown, bar.update, every)
     failed, known = map(np.asarray, unpacked(labels))
     titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]
-    return plots.predicted_maps(
+    return map_figures.predicted_maps(
         data.heights[shown],
         {"predicted": probability},
         failed,

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from travjax.commands import options
 from travjax.config import InputError, read_text
 from travjax.files import first_lines, require_replaceable, save_text, user_path
-from travjax.models import FIELD
+from travjax.models.names import FIELD
 from travjax.progress import wrote
 
 if TYPE_CHECKING:
-    from travjax.trained import Run
+    from travjax.runs.run import Run
 
 PURPOSE = (
     "Predicts which trajectories of a wheeled robot fail on an elevation map, and by which event: step, obstacle, tilt."
@@ -36,8 +36,8 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Writes the file and the card."""
-    from travjax.model_file import SUFFIX, write_model
-    from travjax.trained import load_estimator
+    from travjax.runs.model_file import SUFFIX, write_model
+    from travjax.runs.run import load_estimator
 
     if arguments.to.suffix != SUFFIX:
         raise InputError(f"--to {arguments.to}: must be a {SUFFIX} file")

@@ -7,18 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from travjax import progress, report, traverse
-from travjax.actions import ActionSpace
+from travjax import progress
 from travjax.commands import options
 from travjax.config import one_line, require
-from travjax.dem import load_dem
+from travjax.data.dem import load_dem
+from travjax.data.map_batches import Batch, bytes_each, dem_batches, labelled, samples, synthetic_batches, title
+from travjax.data.npz_stream import NpzStream
+from travjax.evaluation import tables
 from travjax.files import output_folder, save_text, user_path
-from travjax.formats import OTHERS
-from travjax.grid import Grid
-from travjax.labelling import Batch, bytes_each, dem_batches, labelled, samples, synthetic_batches, title
-from travjax.npz_stream import NpzStream
-from travjax.robot import Robot
-from travjax.terrain import STYLES
+from travjax.rasters.formats import OTHERS
+from travjax.simulation import traverse
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.terrain.styles import STYLES
 
 
 def add(commands: options.Commands) -> None:
@@ -53,7 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
         for batch in options.progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling"):
             labels.append(batch)
         maps = labels.arrays
-        table = report.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
+        table = tables.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
         labels.save(config=config, cell_size=grid.spacing)
         shares = save_text(out / "shares.txt", table + "\n")
         print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
@@ -109,13 +111,15 @@ def _shown(crs: str) -> str:
 
 
 def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, out: Path) -> None:
-    from travjax import plots  # matplotlib takes 0.3 s to import
+    from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
     chosen = samples(maps)
     titles = [title(maps, index) for index in chosen]
     heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
     progress.wrote(
-        plots.save(plots.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png")
+        map_figures.save(
+            map_figures.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"
+        )
     )
-    progress.wrote(plots.save(plots.robot_figure(robot), out / "robot.png"))
-    progress.wrote(plots.save(plots.action_figure(actions, robot, grid), out / "actions.png"))
+    progress.wrote(map_figures.save(map_figures.robot_figure(robot), out / "robot.png"))
+    progress.wrote(map_figures.save(map_figures.action_figure(actions, robot, grid), out / "actions.png"))

@@ -8,16 +8,16 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from travjax.actions import ActionSpace
 from travjax.config import InputError, require, to_json
-from travjax.dem_options import AXES_UP, DemOptions
+from travjax.data.map_batches import Batch
 from travjax.files import user_path
-from travjax.footprint import node_table
-from travjax.grid import Grid
-from travjax.labelling import Batch
 from travjax.progress import bar
-from travjax.robot import Robot
-from travjax.terrain import STYLES, require_world
+from travjax.rasters.reading_options import AXES_UP, DemOptions
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.footprint import node_table
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.terrain.styles import STYLES, require_world
 
 Commands = argparse._SubParsersAction
 """What `add(commands)` of a command adds its parser to."""

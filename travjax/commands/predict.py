@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 from travjax import progress
 from travjax.commands import label, options
 from travjax.config import require
+from travjax.data.map_batches import Batch, bytes_each, labelled, samples, title
+from travjax.data.npz_stream import NpzStream
 from travjax.files import output_folder, save_text, user_path
-from travjax.labelling import Batch, bytes_each, labelled, samples, title
-from travjax.models import MODELS
-from travjax.npz_stream import NpzStream
-from travjax.traverse import EVENTS
+from travjax.models.names import MODELS
+from travjax.simulation.traverse import EVENTS
 
 if TYPE_CHECKING:
-    from travjax.predictor import Predictor
+    from travjax.runs.predictor import Predictor
 
 PROBABILITY = 0.5
 """From which a trajectory counts as failing in the printed table."""
@@ -61,9 +61,9 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Predicts, prints the shares that fail, and writes predictions and a figure."""
-    from travjax import report
-    from travjax.predictor import Predictor
-    from travjax.robot import Robot
+    from travjax.evaluation import tables
+    from travjax.runs.predictor import Predictor
+    from travjax.simulation.robot import Robot
 
     predictor = Predictor.load(arguments.checkpoint)
     model, trained = predictor.run.preset.model, predictor.run
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
                 predictions.append(_predicted(batch, predictor, bar.update))
         maps = predictions.arrays
         fails = maps["probability"] >= PROBABILITY
-        table = report.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
+        table = tables.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
         text = f"Predicted to fail, {trained.robot.name}, {len(trained.actions)} trajectories a map, {model}:\n{table}"
         if arguments.check:
             text += f"\n\n{_checked(maps)}"
@@ -108,20 +108,20 @@ def _predicted(batch: Batch, predictor: "Predictor", on_progress: Callable[[int]
 
 def _checked(maps: Batch) -> str:
     """The predictions against the simulator on the maps as given; on noisy ones that is not what a robot meets."""
-    from travjax import metrics, report
+    from travjax.evaluation import metrics, tables
 
     known = maps["known"]
     scores = metrics.evaluate(maps["probability"][known], maps["failed"][known])
-    return f"{AGAINST}:\n{report.metrics_table(scores, None)}"
+    return f"{AGAINST}:\n{tables.metrics_table(scores, None)}"
 
 
 def _figure(maps: Batch, predictor: "Predictor", check: bool, out: Path) -> Path:
     """The action space of a few maps in safe, doubtful and failing; `check` adds the simulator's below it."""
-    from travjax import plots
+    from travjax.evaluation import map_figures
 
     shown, trained = samples(maps), predictor.run
     titles = [title(maps, index) for index in shown]
-    figure = plots.predicted_maps(
+    figure = map_figures.predicted_maps(
         maps["heights"][shown],
         {"predicted": maps["probability"][shown]},
         maps["failed"][shown] if check else None,
@@ -132,4 +132,4 @@ def _figure(maps: Batch, predictor: "Predictor", check: bool, out: Path) -> Path
         trained.grid,
         SIMULATOR,
     )
-    return plots.save(figure, out / "predictions.png")
+    return map_figures.save(figure, out / "predictions.png")

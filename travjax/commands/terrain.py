@@ -6,10 +6,10 @@ import numpy as np
 
 from travjax import progress
 from travjax.commands import options
+from travjax.data.map_batches import joined, synthetic_batches
 from travjax.files import output_folder, save_npz
-from travjax.grid import Grid
-from travjax.labelling import joined, synthetic_batches
-from travjax.terrain import STYLES
+from travjax.simulation.grid import Grid
+from travjax.terrain.styles import STYLES
 
 
 def add(commands: options.Commands) -> None:
@@ -23,7 +23,7 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Makes maps of each style and writes them, and a contact sheet of each style."""
-    from travjax import plots  # matplotlib takes 0.3 s to import
+    from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
     grid = Grid(arguments.size, arguments.spacing)
     styles = arguments.style or list(STYLES)
@@ -40,8 +40,10 @@ def run(arguments: argparse.Namespace) -> None:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
         titles = [f"seed {seed}" for seed in maps["seed"][chosen]]
         progress.wrote(
-            plots.save(
-                plots.contact_sheet(maps["heights"][chosen], titles, f"{style}: {len(chosen)} of {count} maps", grid),
+            map_figures.save(
+                map_figures.contact_sheet(
+                    maps["heights"][chosen], titles, f"{style}: {len(chosen)} of {count} maps", grid
+                ),
                 out / f"terrain_{style}.png",
             )
         )

@@ -10,15 +10,15 @@ from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, one_line, require
 from travjax.files import find_preset, held, output_folder, put_back, user_path
-from travjax.models import FOLDERS, MODELS, RESNET
+from travjax.models.names import FOLDERS, MODELS, RESNET
 from travjax.signals import going_on
 
 if TYPE_CHECKING:
-    from travjax.dataset import Dataset
-    from travjax.parallel import Devices
-    from travjax.preset import Preset
-    from travjax.train import Trainer
-    from travjax.trained import Run
+    from travjax.data.dataset import Dataset
+    from travjax.devices import Devices
+    from travjax.runs.preset import Preset
+    from travjax.runs.run import Run
+    from travjax.training.trainer import Trainer
 
 
 def add(commands: options.Commands) -> None:
@@ -68,7 +68,7 @@ def add_run(parser: argparse._ActionsContainer) -> None:
 
 def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
     """The run of a preset with what `add_run` lets differ from it."""
-    from travjax.trained import Run
+    from travjax.runs.run import Run
 
     if arguments.weights:
         preset = replace(preset, weights=arguments.weights)
@@ -85,8 +85,8 @@ def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains."""
-    from travjax.parallel import Devices, join
-    from travjax.preset import Preset
+    from travjax.devices import Devices, join
+    from travjax.runs.preset import Preset
 
     shared = (arguments.coordinator, arguments.processes, arguments.process)
     if any(value is not None for value in shared):
@@ -127,10 +127,10 @@ def train(
 
 def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, resume: bool, option: str) -> None:
     """`train` in a folder that no other process uses."""
-    from travjax.imagenet import load_weights
-    from travjax.preset import find_weights
-    from travjax.train_field import trainer_of
-    from travjax.trained import has_checkpoints
+    from travjax.resnet.imagenet_weights import load_weights
+    from travjax.runs.preset import find_weights
+    from travjax.runs.run import has_checkpoints
+    from travjax.training.map_training import trainer_of
 
     preset = wanted.preset
     resumes = has_checkpoints(folder)
@@ -158,7 +158,7 @@ def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, r
 
 def _check_folder(folder: Path, wanted: "Run", resume: bool, option: str) -> None:
     """A run is neither overwritten nor continued with other settings."""
-    from travjax.trained import Run
+    from travjax.runs.run import Run
 
     if not resume:
         raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
@@ -167,9 +167,9 @@ def _check_folder(folder: Path, wanted: "Run", resume: bool, option: str) -> Non
 
 def _dataset(data: Path | None, wanted: "Run", folder: Path, devices: "Devices") -> "Dataset":
     """The data set that is given, else the run's own, made if it is not there yet."""
-    from travjax import dataset
     from travjax.commands.dataset import made
-    from travjax.trained import DATA
+    from travjax.data import dataset
+    from travjax.runs.run import DATA
 
     if data:
         return dataset.load(data)
@@ -190,8 +190,8 @@ def _draw_inputs(trainer: "Trainer", folder: Path) -> Path:
     """The three channels of a few training samples."""
     import numpy as np
 
-    from travjax import curves, plots
-    from travjax.inputs import render_inputs
+    from travjax.evaluation import map_figures, score_figures
+    from travjax.models.input_images import render_inputs
 
     samples, data, run = trainer.data.samples(2, 0), trainer.data.dataset, trainer.run
     chosen = np.linspace(0, len(samples[0]) - 1, 4).astype(int)
@@ -204,16 +204,18 @@ def _draw_inputs(trainer: "Trainer", folder: Path) -> Path:
         f"{one_line(group, 30)}, trajectory {index}"
         for group, index in zip(data.group[maps], trajectories, strict=True)
     ]
-    return plots.save(curves.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png")
+    return map_figures.save(
+        score_figures.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png"
+    )
 
 
 def _finish(folder: Path) -> None:
     """The figure of the run, and where everything is."""
-    from travjax import curves, plots
-    from travjax.runlog import read_rows
+    from travjax.evaluation import map_figures, score_figures
+    from travjax.runs.run_log import read_rows
 
     rows = folder / "metrics.jsonl"
     progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         progress.wrote(path)
-    progress.wrote(plots.save(curves.training_figure(read_rows(rows)), folder / "training.png"))
+    progress.wrote(map_figures.save(score_figures.training_figure(read_rows(rows)), folder / "training.png"))

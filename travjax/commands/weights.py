@@ -8,10 +8,10 @@ from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, require
 from travjax.files import output_folder, user_path
-from travjax.preprocessing import INPUTS
+from travjax.resnet.preprocessing import INPUTS
 
 if TYPE_CHECKING:
-    from travjax.imagenet import Weights
+    from travjax.resnet.imagenet_weights import Weights
 
 
 def add(commands: options.Commands) -> None:
@@ -63,7 +63,7 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Reads or fetches weights, prints what was found and writes them."""
-    from travjax.imagenet import describe, load_weights, save_safetensors  # flax takes 0.5 s to import
+    from travjax.resnet.imagenet_weights import describe, load_weights, save_safetensors  # flax takes 0.5 s to import
 
     if arguments.path:
         require(arguments.file is None, "--file", arguments.file, "left out where --from is given")
@@ -83,7 +83,7 @@ def _told(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _fetched(arguments: argparse.Namespace) -> "Weights":
     """Weights of the hub, the repository in their origin."""
-    from travjax.imagenet import HUB, fetch, load_weights
+    from travjax.resnet.imagenet_weights import HUB, fetch, load_weights
 
     repository, filename = arguments.hub or HUB[0], arguments.file or HUB[1]
     try:

@@ -15,18 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from travjax import bench, curves, metrics, plots, progress
+from travjax import progress
 from travjax.config import InputError, require, to_json
+from travjax.data.provenance import SitesConfig
+from travjax.evaluation import map_figures, metrics, score_figures, simulator_benchmark
+from travjax.evaluation.metrics import OVERALL
+from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch, timing
-from travjax.files import find_data, output_folder, save_text, user_path
-from travjax.metrics import OVERALL
-from travjax.models import FIELD, RESNET
-from travjax.predictor import Predictor
-from travjax.provenance import SitesConfig
-from travjax.report import rows_table
-from travjax.resnet import ResNetConfig
-from travjax.robustness import CLEAN, CORRUPTIONS, Ground, of_sites
-from travjax.robustness_scores import (
+from travjax.experiments.robustness import CLEAN, CORRUPTIONS, Ground, of_sites
+from travjax.experiments.robustness_scores import (
     FILTERED,
     HAZARD,
     IN_FIGURE,
@@ -41,8 +38,12 @@ from travjax.robustness_scores import (
     shown,
     sites_table,
 )
-from travjax.training_step import LARGE_MARGIN
-from travjax.traverse import EVENTS
+from travjax.files import find_data, output_folder, save_text, user_path
+from travjax.models.names import FIELD, RESNET
+from travjax.resnet.network import ResNetConfig
+from travjax.runs.predictor import Predictor
+from travjax.simulation.traverse import EVENTS
+from travjax.training.step import LARGE_MARGIN
 
 SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
 
@@ -236,7 +237,7 @@ def _on_synthetic_ground(
     headline = (
         f"{field.run.robot.name}, {arguments.maps} test maps and {arguments.validation_maps} "
         f"validation maps that no preset trains on, {len(field.run.actions)} trajectories each, seed {arguments.seed}; "
-        f"{bench.machine()}."
+        f"{simulator_benchmark.machine()}."
     )
     network = clean["methods"].get(NETWORK)
     if network:
@@ -245,14 +246,17 @@ def _on_synthetic_ground(
     lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
     save_text(out / "f1.tsv", "\n".join(lines) + "\n")
     seconds = {row["what"]: row["seconds"] for row in rows}
-    figures = {"robustness": curves.robustness_figure(f1), "quality": curves.quality_figure(_points(f1, seconds))}
+    figures = {
+        "robustness": score_figures.robustness_figure(f1),
+        "quality": score_figures.quality_figure(_points(f1, seconds)),
+    }
     tables = {
         "Quality": f"{quality_table(clean)}\n\n{margins}",
         "Maps as sensors see them": rows_table(noisy, columns),
         "Time": rows_table(rows, timing.COLUMNS),
     }
     numbers = {"maps": metrics.to_json(results), "times": metrics.to_json(rows)}
-    files = [plots.save(figure, out / f"{name}.png") for name, figure in figures.items()]
+    files = [map_figures.save(figure, out / f"{name}.png") for name, figure in figures.items()]
     return Part([headline, MEANING], tables, numbers, [out / "f1.tsv", *files])
 
 
@@ -275,7 +279,7 @@ def _on_real_ground(
     table = sites_table(scores, chosen)
     save_text(out / "sites.txt", f"{headline}\n\n{table}\n")
     f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
-    figure = plots.save(curves.sites_figure(f1, IN_FIGURE), out / "sites.png")
+    figure = map_figures.save(score_figures.sites_figure(f1, IN_FIGURE), out / "sites.png")
     numbers = {
         "sites": to_json(config),
         "windows": {site: len(ground.heights) for site, ground in real.items()},

@@ -10,19 +10,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from travjax import progress
-from travjax.bench import machine
 from travjax.commands import train
 from travjax.commands.evaluate import evaluate
 from travjax.config import read_text
+from travjax.devices import Devices
+from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
+from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import launch
 from travjax.files import find_preset, held, user_path
-from travjax.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
-from travjax.parallel import Devices
-from travjax.preset import Preset
-from travjax.runlog import read_rows
+from travjax.runs.preset import Preset
+from travjax.runs.run import Run
+from travjax.runs.run_log import read_rows
 from travjax.signals import going_on
-from travjax.trained import Run
-from travjax.traverse import as_in_paper
+from travjax.simulation.traverse import as_in_paper
 
 DESCRIPTION = (
     "Makes synthetic maps, trains the estimator on them and evaluates it on maps that it has not seen: the first half "

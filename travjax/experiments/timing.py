@@ -11,19 +11,20 @@ from pathlib import Path
 
 import jax
 
-from travjax import bench, plots, progress
-from travjax.actions import ActionSpace
-from travjax.bench_network import BATCH, Bench
+from travjax import progress
 from travjax.commands import options
 from travjax.config import require
+from travjax.devices import Devices
+from travjax.evaluation import map_figures, simulator_benchmark
+from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
 from travjax.files import find_preset, output_folder, written_whole
-from travjax.grid import Grid
-from travjax.parallel import Devices
-from travjax.preset import Preset
-from travjax.report import rows_table
-from travjax.resnet import ResNetConfig
-from travjax.robot import Robot
+from travjax.resnet.network import ResNetConfig
+from travjax.runs.preset import Preset
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.training.network_benchmark import BATCH, Bench
 
 COLUMNS = {
     "what": "what",
@@ -80,14 +81,14 @@ def run(arguments: argparse.Namespace) -> None:
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.batch > 0, "--batch", arguments.batch, "at least 1")
     Devices.all().check_batch(arguments.batch)
-    bench.check(robot, actions, grid)
+    simulator_benchmark.check(robot, actions, grid)
     trunk = ResNetConfig()
     if arguments.network:
         trunk = Preset.load(find_preset(arguments.network, "train")).trunk
     out = output_folder(arguments.out)
     rows = _of_paper() if actions == ActionSpace() else []
     rows += measured(robot, actions, grid, trunk, arguments.batch, arguments.repeats)
-    _write(rows, f"{robot.name}, {len(actions)} trajectories of a map; {bench.machine()}", out)
+    _write(rows, f"{robot.name}, {len(actions)} trajectories of a map; {simulator_benchmark.machine()}", out)
 
 
 def measured(
@@ -95,14 +96,16 @@ def measured(
 ) -> list[dict]:
     """A row for each way to all trajectories of a map, on the device at hand, with progress bars."""
     with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
-        row = bench.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
+        row = simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
-    rows = [_row(SEQUENTIAL, f"{bench.processor()}, one core", sequential, len(actions), sequential, repeats)]
+    rows = [
+        _row(SEQUENTIAL, f"{simulator_benchmark.processor()}, one core", sequential, len(actions), sequential, repeats)
+    ]
 
     def others() -> Iterator[dict]:
         device = _device()
         for maps in (1, TOGETHER):
-            row = bench.labelling_row(maps, robot, actions, grid, repeats)
+            row = simulator_benchmark.labelling_row(maps, robot, actions, grid, repeats)
             what = f"batched simulator, {maps} map{'s at once' if maps > 1 else ''}"
             yield _row(what, device, row["ms_per_map"] / 1e3, len(actions), sequential, repeats)
         row = Bench(robot, actions, grid, repeats, trunk).all_trajectories(batch, repeats)
@@ -137,7 +140,7 @@ def _device() -> str:
     """What JAX runs on."""
     devices = jax.devices()
     if devices[0].platform == "cpu":
-        return f"{bench.processor()}, {os.cpu_count()} cores"
+        return f"{simulator_benchmark.processor()}, {os.cpu_count()} cores"
     return devices[0].device_kind if len(devices) == 1 else f"{len(devices)} x {devices[0].device_kind}"
 
 
@@ -146,8 +149,8 @@ def _write(rows: list[dict], headline: str, out: Path) -> None:
     table = rows_table(rows, COLUMNS)
     print(f"\n{headline}\n{table}\n")
     with written_whole(out / "timing.tsv") as temporary:
-        bench.write_tsv(rows, temporary, COLUMNS)
-    figure = plots.save(plots.timing_figure(rows), out / "timing.png")
+        simulator_benchmark.write_tsv(rows, temporary, COLUMNS)
+    figure = map_figures.save(map_figures.timing_figure(rows), out / "timing.png")
     pieces: list[launch.Piece] = [f"{headline}.", launch.verbatim(table), MEANING, figure]
     progress.wrote(out / "timing.tsv", figure, launch.write_report(out, "All trajectories of a map", pieces))
 

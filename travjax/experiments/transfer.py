@@ -1,7 +1,7 @@
 """`python -m travjax.experiments.transfer`: what pre-training on synthetic maps is worth on real ones.
 
-Trains every arm of transfer.py and writes tables, figures, a report and all numbers as JSON. The recorded run is under
-experiments/transfer.
+Trains every arm of transfer_runs.py and writes tables, figures, a report and all numbers as JSON. The recorded run is
+under experiments/transfer.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from travjax.commands import evaluate, train
 from travjax.config import InputError, load_toml, read_text, require, to_json
 from travjax.experiments import launch
 from travjax.files import find_preset, held, put_back, save_text, user_path
-from travjax.models import FIELD, MODELS, RESNET
+from travjax.models.names import FIELD, MODELS, RESNET
 from travjax.signals import going_on
 
 DESCRIPTION = (
@@ -71,9 +71,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     """The experiment of a preset in a folder that no other process uses."""
-    from travjax.parallel import Devices
-    from travjax.transfer import Transfer, TransferConfig, run_all
-    from travjax.transfer_scores import Results
+    from travjax.devices import Devices
+    from travjax.evaluation.transfer_scores import Results
+    from travjax.experiments.transfer_runs import Transfer, TransferConfig, run_all
 
     config, devices = load_toml(path, TransferConfig), Devices.all()
     _require_same(out, config)
@@ -100,8 +100,8 @@ def _require_same(out: Path, config) -> None:
 
 def _base(preset: Path, arguments: argparse.Namespace):
     """The run of the synthetic model: that of the folder given, else that of the experiment."""
-    from travjax.preset import Preset
-    from travjax.trained import Run
+    from travjax.runs.preset import Preset
+    from travjax.runs.run import Run
 
     if not arguments.synthetic:
         return train.run_of(Preset.load(preset), arguments)
@@ -124,8 +124,8 @@ TABLES = "evaluation/tables.txt"
 
 def _data(sites: Path, given: Path | None, base, out: Path):
     """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
-    from travjax import dataset
-    from travjax.trained import DATA
+    from travjax.data import dataset
+    from travjax.runs.run import DATA
 
     if given:
         return dataset.load(given)
@@ -133,18 +133,18 @@ def _data(sites: Path, given: Path | None, base, out: Path):
     if (out / DATA / "dataset.json").exists():
         return dataset.load(out / DATA)
     from travjax.commands.dataset import made_of_sites
-    from travjax.provenance import SitesConfig
+    from travjax.data.provenance import SitesConfig
 
     return made_of_sites(SitesConfig.load(sites), base.robot, base.actions, base.grid, out / DATA)
 
 
 def _write(transfer, results, out: Path) -> None:
     """Tables, figures, JSON and the report."""
-    from travjax import curves, plots
-    from travjax.bench import machine
-    from travjax.statistics import statistics_table
-    from travjax.transfer import IMAGENET
-    from travjax.transfer_scores import arms_table, events_table, results_json
+    from travjax.evaluation import map_figures, score_figures
+    from travjax.evaluation.dataset_tables import statistics_table
+    from travjax.evaluation.simulator_benchmark import machine
+    from travjax.evaluation.transfer_scores import arms_table, events_table, results_json
+    from travjax.experiments.transfer_runs import IMAGENET
 
     config, base = transfer.config, transfer.base
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
@@ -156,9 +156,9 @@ def _write(transfer, results, out: Path) -> None:
     for title, table in tables.items():
         print(f"\n{title}\n{table}")
     print()
-    figures = [plots.save(curves.transfer_figure(results, COLOURS), out / "f1.png")]
+    figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS), out / "f1.png")]
     if config.shown_maps:
-        figures.append(plots.save(_maps_figure(transfer), out / "maps.png"))
+        figures.append(map_figures.save(_maps_figure(transfer), out / "maps.png"))
     described: dict[str, Any] = {
         "config": to_json(config),
         "synthetic": to_json(base.preset),
@@ -196,7 +196,7 @@ MEANING = (
 
 def _samples(transfer) -> str:
     """What an epoch is trained on."""
-    from travjax.training_data import TrainingData
+    from travjax.training.trajectory_samples import TrainingData
 
     if transfer.base.preset.model == FIELD:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
@@ -205,9 +205,9 @@ def _samples(transfer) -> str:
 
 def _maps_figure(transfer):
     """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
-    from travjax import plots
-    from travjax.evaluate import Evaluator
-    from travjax.traverse import unpacked
+    from travjax.evaluation import map_figures
+    from travjax.simulation.traverse import unpacked
+    from travjax.training.evaluator import Evaluator
 
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.of(base, data, transfer.devices)
@@ -220,7 +220,7 @@ def _maps_figure(transfer):
     failed, known = map(np.asarray, unpacked(data.labels[shown]))
     places = data.provenance.origin[shown] if data.provenance else shown
     titles = [f"{config.shown}, SW {np.round(place, 1).tolist()}" for place in places]
-    return plots.predicted_maps(
+    return map_figures.predicted_maps(
         data.heights[shown], predictions, failed, known, titles, base.robot, base.actions, base.grid
     )
 

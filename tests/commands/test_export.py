@@ -1,0 +1,182 @@
+"""`travjax export`: the file, its model card, and the one line for each bad input."""
+
+import re
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from tests.commandline import FEW, files, run_words
+from tests.field_runs import CONFIG, begun
+from tests.small_training import copy, dataset, host, require_equal
+from travjax.commands.export import card
+from travjax.models.trajectory_resnet import take_apart
+from travjax.runs.checkpoint import load_meta
+from travjax.runs.model_file import read_model
+from travjax.runs.predictor import DEFAULT, WEIGHTS, Predictor
+from travjax.runs.run import load_estimator
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+
+pytestmark = pytest.mark.usefixtures("shared_code")
+
+
+@pytest.fixture(scope="module")
+def field(tmp_path_factory) -> Path:
+    """The folder of a short run of a tiny hazard field."""
+    folder = tmp_path_factory.mktemp("field") / "run"
+    begun(folder, epochs=2).train()
+    return folder
+
+
+def exported(folder: Path, to: Path, *words) -> str:
+    code, out, err = run_words("export", folder, "--to", to, *words)
+    assert code == 0, err
+    return out
+
+
+def refusal(*words) -> str:
+    code, _, err = run_words("export", *words)
+    line = err.strip().splitlines()[-1]
+    assert code == 2 and line.startswith("travjax: ") and err.count("travjax: ") == 1
+    return line.removeprefix("travjax: ")
+
+
+def row(card: str, name: str) -> str:
+    return re.search(rf"^\| {name} \| (.*) \|$", card, re.MULTILINE)[1]
+
+
+def test_the_file_and_its_card_are_written_and_printed(field, tmp_path):
+    to = tmp_path / "my_field.safetensors"
+    assert exported(field, to) == f"{to}\n{to.with_suffix('.md')}\n"
+    assert files(tmp_path) == {to, to.with_suffix(".md")}
+
+
+@pytest.mark.parametrize("which", ["best", "latest"])
+def test_the_file_holds_the_checkpoint_that_is_named(field, tmp_path, which):
+    to = tmp_path / "it.safetensors"
+    exported(field, to, "--checkpoint", which)
+    (run, network, notes), (wanted, trained, meta) = read_model(to), load_estimator(field, which)
+    assert run == wanted
+    require_equal(host(take_apart(network)[1]), host(take_apart(trained)[1]))
+    position = meta["position"]
+    assert notes == {"dataset": dataset().fingerprint, "epoch": position["epoch"], "step": position["total"]}
+    if which == "latest":
+        assert notes["step"] == 10
+
+
+def test_the_best_checkpoint_is_exported_unless_told_otherwise(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors")
+    best = load_meta(field / "checkpoints", "best")["position"]["total"]
+    assert read_model(tmp_path / "it.safetensors")[2]["step"] == best
+
+
+def test_the_file_predicts_as_the_run_does(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors")
+    one, other = (
+        Predictor.load(source).predict(dataset().heights[:2]) for source in (field, tmp_path / "it.safetensors")
+    )
+    np.testing.assert_array_equal(one.probability, other.probability)
+    np.testing.assert_array_equal(one.margins, other.margins)
+
+
+def test_the_card_says_what_it_was_trained_on(field, tmp_path):
+    exported(field, tmp_path / "it.safetensors", "--checkpoint", "latest")
+    said = (tmp_path / "it.md").read_text()
+    assert said.startswith("# it.safetensors\n")
+    count = sum(leaf.size for leaf in jax.tree.leaves(take_apart(load_estimator(field)[1])[1]))
+    assert row(said, "estimator") == f"field, {count:,} parameters" and CONFIG.hidden == 8
+    assert row(said, "robot").startswith("Husky A200; ")
+    assert row(said, "maps") == f"4 x 4 m at 0.125 m, {len(FEW)} trajectories"
+    wanted = f"30 synthetic maps of seed 5 (fingerprint {dataset().fingerprint}), seed 0, 10 steps"
+    assert row(said, "trained on") == wanted
+    assert row(said, "corrupted").startswith("50% of the maps: noise up to 0.02 m")
+    assert "not evaluated: `travjax evaluate` writes the tables" in said
+
+
+def test_the_card_holds_the_tables_of_the_evaluation(field, tmp_path):
+    folder = copy(field, tmp_path / "run")
+    (folder / "evaluation").mkdir()
+    (folder / "evaluation/tables.txt").write_text("F1 of everything\n0.5\n")
+    exported(folder, tmp_path / "it.safetensors")
+    said = (tmp_path / "it.md").read_text()
+    assert "```\nF1 of everything\n0.5\n```" in said and "not evaluated" not in said
+
+
+def test_the_card_of_a_hazard_field_holds_what_was_measured_on_real_ground(field, tmp_path):
+    folder = copy(field, tmp_path / "run")
+    exported(folder, tmp_path / "it.safetensors")
+    said = (tmp_path / "it.md").read_text()
+    assert "## Beside the simulator, on real ground" in said and "Not measured: `python -m " in said
+    (folder / "comparison").mkdir()
+    (folder / "comparison/sites.txt").write_text("F1 on a hill\n0.4\n")
+    exported(folder, tmp_path / "again.safetensors")
+    said = (tmp_path / "again.md").read_text()
+    assert "```\nF1 on a hill\n0.4\n```\n\nLimits: " in said and "Not measured" not in said
+
+
+def test_the_card_of_the_estimator_that_comes_with_the_package_holds_what_is_recorded():
+    trained, _, notes = read_model(WEIGHTS / f"{DEFAULT}.safetensors")
+    tables, real = (
+        (EXPERIMENTS / name).read_text().strip()
+        for name in ("field/laptop/evaluation/tables.txt", "comparison/real/sites.txt")
+    )
+    assert (WEIGHTS / f"{DEFAULT}.md").read_text() == card(trained, notes, f"{DEFAULT}.safetensors", tables, real)
+
+
+def test_a_resnet_is_exported_too(trained, tmp_path):
+    exported(trained, tmp_path / "it.safetensors", "--checkpoint", "heads")
+    run, network, notes = read_model(tmp_path / "it.safetensors")
+    assert run.preset.model == "resnet50" and notes["step"] == 14
+    require_equal(host(take_apart(network)[1]), host(take_apart(load_estimator(trained, "heads")[1])[1]))
+    said = (tmp_path / "it.md").read_text()
+    assert row(said, "estimator").startswith("resnet50, ") and "Beside the simulator" not in said
+
+
+def test_a_card_and_a_file_of_ours_are_replaced(field, tmp_path):
+    to = tmp_path / "it.safetensors"
+    for which in ("latest", "best"):
+        exported(field, to, "--checkpoint", which)
+    best = load_meta(field / "checkpoints", "best")["position"]["total"]
+    assert f", {best:,} steps" in row((tmp_path / "it.md").read_text(), "trained on")
+
+
+# ---- Bad input
+
+
+@pytest.mark.parametrize(
+    ("name", "what"), [("notes.md", "model card"), ("notes.safetensors", "estimator"), ("notes.md/mine", "model card")]
+)
+def test_no_file_of_the_user_s_is_replaced(field, tmp_path, name, what):
+    mine = tmp_path / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("# notes.safetensors\n\nmine\n")
+    before, to = files(tmp_path), tmp_path / "notes.safetensors"
+    way = f"{tmp_path / name.split('/')[0]} is in the way, and no {what} of travjax"
+    assert refusal(field, "--to", to) == f"--to {to}: {way}; allowed: another name, or none there"
+    assert files(tmp_path) == before and mine.read_text() == "# notes.safetensors\n\nmine\n"
+
+
+def test_another_kind_of_file_is_one_line(field, tmp_path):
+    said = refusal(field, "--to", tmp_path / "it.npz")
+    assert said == f"--to {tmp_path / 'it.npz'}: must be a .safetensors file"
+    assert files(tmp_path) == set()
+
+
+def test_what_is_no_run_is_one_line(tmp_path):
+    said = refusal(tmp_path / "none", "--to", tmp_path / "it.safetensors")
+    assert said.startswith(f"{tmp_path / 'none/run.json'}: cannot be read: No such file or directory")
+    assert files(tmp_path) == set()
+
+
+def test_a_checkpoint_that_is_not_there_is_one_line(field, tmp_path):
+    said = refusal(field, "--to", tmp_path / "it.safetensors", "--checkpoint", "heads")
+    assert "holds no checkpoint 'heads'; it holds: " in said
+    assert files(tmp_path) == set()
+
+
+def test_a_folder_that_is_not_there_is_one_line(field, tmp_path):
+    to = tmp_path / "none/it.safetensors"
+    assert refusal(field, "--to", to).startswith(f"{to}: cannot be written: No such file or directory")
+    assert files(tmp_path) == set()

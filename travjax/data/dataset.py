@@ -1,0 +1,338 @@
+"""The data set: maps, the labels of all their trajectories, and which split each map belongs to (SPEC section 7).
+
+`generate` makes it from one seed, all in memory, and sites.py makes one of real maps; `save` and `load` keep it as one
+folder of .npy files with a `dataset.json` that holds the configurations and each file's size and SHA-256.
+"""
+
+import dataclasses
+import hashlib
+import json
+import math
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.metadata import version
+from numbers import Integral
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from travjax.config import (
+    InputError,
+    naming,
+    one_line,
+    parts_from_json,
+    read_json,
+    require,
+    require_number,
+    to_json,
+)
+from travjax.data.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, read_table
+from travjax.data.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
+from travjax.data.sampling import UNKNOWN, random_keys
+from travjax.files import folder_written_whole, put_back, sha256, user_path
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.footprint import node_table
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import failures, packed, simulate
+from travjax.terrain.styles import STYLES, generate_terrain, require_world
+
+ARRAYS = ("heights", "labels", "group", "seed", "split")
+"""Each is a file of its own, `heights.npy` and so on; real maps have PROVENANCE_ARRAYS as well."""
+
+CHUNK = 256
+"""Maps made and labelled before they are copied into the arrays."""
+
+Progress = Callable[[int], object]
+
+
+@dataclass(frozen=True)
+class DatasetConfig:
+    """What a synthetic data set is made from.
+
+    maps:             number of maps, the five styles in turn
+    seed:             gives the terrain seeds and the splits
+    validation, test: shares of the maps, the rest is for training
+    world:            metres, the map size that features are derived from; the maps' own unless given
+    """
+
+    maps: int = 56_840
+    seed: int = 0
+    validation: float = 0.08
+    test: float = 0.02
+    world: float | None = None
+
+    def __post_init__(self):
+        whole = lambda value: isinstance(value, Integral) and not isinstance(value, bool)
+        require(whole(self.maps) and 1 <= self.maps <= 10**7, "maps", self.maps, "a whole number from 1 to 10000000")
+        require(whole(self.seed) and 0 <= self.seed < 2**63, "seed", self.seed, "a whole number from 0 to 2^63 - 1")
+        for name in ("validation", "test"):
+            require_number(name, getattr(self, name), -math.inf, 1, "a share from 0 to 1")
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a share from 0 to 1")
+        require_world(self.world)
+        require(self.validation + self.test <= 1, "validation + test", self.validation + self.test, "at most 1")
+
+    def styles(self) -> np.ndarray:
+        """The style of each map: [n] texts."""
+        return np.resize(np.array(STYLES), self.maps)
+
+    def seeds(self) -> np.ndarray:
+        """The terrain seed of each map: [n] uint32, all different.
+
+        Data sets of another seed or size have practically no map in common.
+        """
+        spare = 64 + self.maps // 16  # for the few that come twice
+        keys = random_keys(("terrain", (self.seed, self.maps)), np.arange(self.maps + spare)) >> np.uint64(32)
+        first = np.sort(np.unique(keys, return_index=True)[1])
+        return keys[first[: self.maps]].astype(np.uint32)
+
+    def split_sizes(self) -> tuple[int, int, int]:
+        """Maps of each of SPLITS: the shares rounded down, the rest for training.
+
+        The paper's 56,840 maps give 51157, 4547 and 1136, its own number of test maps. From three maps on
+        each split whose share is not 0 has one at least.
+        """
+        test, validation = (math.floor(share * self.maps + 1e-9) for share in (self.test, self.validation))
+        sizes = [self.maps - validation - test, validation, test]
+        shares = (1 - self.validation - self.test, self.validation, self.test)
+        for index, share in enumerate(shares):
+            if self.maps >= len(SPLITS) and share > 1e-9 and not sizes[index]:
+                sizes[sizes.index(max(sizes))] -= 1
+                sizes[index] = 1
+        return tuple(sizes)  # type: ignore[return-value]
+
+    def splits(self) -> np.ndarray:
+        """The split of each map: [n] uint8 index into SPLITS. Styles differ by one map at most in each split.
+
+        The maps of each style are shuffled among the places of that style, and each split takes a run of places.
+        """
+        keys = random_keys(("split", (self.seed, self.maps)), np.arange(self.maps))
+        order = np.arange(self.maps)
+        for style in range(len(STYLES)):
+            members = order[style :: len(STYLES)]
+            order[style :: len(STYLES)] = members[np.argsort(keys[members], kind="stable")]
+        split = np.empty(self.maps, np.uint8)
+        split[order] = np.repeat(np.arange(len(SPLITS), dtype=np.uint8), self.split_sizes())
+        return split
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Maps, labels and splits; arrays on the host, to be read only.
+
+    heights: [n, rows, cols] float32 metres, NaN unknown
+    labels:  [n, t] uint8, one byte a trajectory as traverse.py packs them
+    group:   [n] style or site name; a style if there is a `config`
+    seed:    [n] uint32 terrain seed; 0 for real maps
+    split:   [n] uint8 index into SPLITS
+    robot, actions, grid: what the labels hold for
+    config:  what the maps were made from; None for real maps
+    provenance: where real maps come from; None if that is not known
+
+    Raises InputError when the arrays do not fit together.
+    """
+
+    heights: np.ndarray
+    labels: np.ndarray
+    group: np.ndarray
+    seed: np.ndarray
+    split: np.ndarray
+    robot: Robot
+    actions: ActionSpace
+    grid: Grid
+    config: DatasetConfig | None
+    provenance: Provenance | None = None
+
+    def __post_init__(self):
+        require(not (self.config and self.provenance), "provenance", "given", "left out where there is a config")
+        maps = self.config.maps if self.config else np.size(self.split)
+        require(maps > 0, "split", [], "of one map at least")
+        expected = {
+            "heights": ((maps, *self.grid.shape), "f4"),
+            "labels": ((maps, len(self.actions)), "u1"),
+            "group": ((maps,), "U"),
+            "seed": ((maps,), "u4"),
+            "split": ((maps,), "u1"),
+            "origin": ((maps, 2), "f8"),
+            "quarter_turns": ((maps,), "u1"),
+        }
+        for name, array in self.arrays.items():
+            shape, kind = expected[name]
+            fits = array.shape == shape and kind in (array.dtype.kind, array.dtype.str[1:]) and array.dtype.isnative
+            allowed = f"{list(shape)} of {'text' if kind == 'U' else np.dtype(kind)}"
+            require(fits, name, f"{list(array.shape)} of {array.dtype}", allowed)
+        wrong = self.split[self.split >= len(SPLITS)]
+        require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
+        largest = int(self.labels.max(initial=0))
+        require(largest < 2 * UNKNOWN, "labels", largest, f"from 0 to {2 * UNKNOWN - 1}")
+        groups = STYLES if self.config else self.provenance and [site.name for site in self.provenance.sites]
+        unknown = self.group[~np.isin(self.group, groups)] if groups else self.group[:0]
+        require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays by name, those of the provenance last."""
+        return {name: getattr(self, name) for name in ARRAYS} | (self.provenance.arrays if self.provenance else {})
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Tells data sets apart: a hash of labels, seeds, groups and splits, and of heights and places of real maps."""
+        digest = hashlib.sha256("\n".join(self.group).encode(errors="surrogatepass"))
+        places = [] if self.config else [self.heights, *(self.provenance.arrays.values() if self.provenance else ())]
+        for array in (self.labels, self.seed, self.split, *places):
+            digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()[:16]
+
+    def maps_of(self, split: str) -> np.ndarray:
+        """Indices of the maps of "train", "validation" or "test": [k]."""
+        require(split in SPLITS, "split", split, f"one of {', '.join(SPLITS)}")
+        return np.flatnonzero(self.split == SPLITS.index(split))
+
+
+def generate(
+    config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
+) -> Dataset:
+    """Makes and labels the maps; the same arguments give the same data set.
+
+    on_progress is called with the number of maps that were added. Memory: the arrays, 4.0 GB for the paper's 56,840
+    maps, and a few hundred MB of work. Raises InputError when robot, actions and grid do not fit together.
+    """
+    node_table(robot, actions, grid)
+    styles, seeds = config.styles(), config.seeds()
+    heights = np.empty((config.maps, *grid.shape), np.float32)
+    labels = np.empty((config.maps, len(actions)), np.uint8)
+    for start in range(0, config.maps, CHUNK):
+        chunk = slice(start, min(start + CHUNK, config.maps))
+        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid, world=config.world)
+        margins = simulate(made, robot, actions, grid=grid)
+        labels[chunk] = packed(failures(margins, robot), margins.known)
+        heights[chunk] = made
+        if on_progress:
+            on_progress(chunk.stop - start)
+    return Dataset(heights, labels, styles, seeds, config.splits(), robot, actions, grid, config)
+
+
+def require_same(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+    """Raises InputError, which names both, unless the data set is labelled for this robot, action space and grid."""
+    for name, given in (("robot", robot), ("actions", actions), ("grid", grid)):
+        ours = getattr(dataset, name)
+        if ours != given:
+            fields = [field.name for field in dataclasses.fields(ours)]
+            differing = [field for field in fields if getattr(ours, field) != getattr(given, field)]
+            both = [", ".join(f"{field} = {getattr(one, field)!r}" for field in differing) for one in (ours, given)]
+            theirs, wanted = (one_line(one, 160) for one in both)
+            raise InputError(f"{name} of the data set: {theirs}; must be as here: {wanted}")
+
+
+def configs_to_json(dataset: Dataset) -> dict[str, Any]:
+    """All of a data set but its arrays as JSON can hold it, with the version of travjax."""
+    parts = {name: getattr(dataset, name) for name in ("robot", "actions", "grid", "config")}
+    table = {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
+    return table | ({"provenance": dataset.provenance.to_json()} if dataset.provenance else {})
+
+
+def put_together(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
+    """The data set of what `configs_to_json` gave and its arrays; raises InputError when they are something else."""
+    synthetic = table.get("config") is not None
+    kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid} | ({"config": DatasetConfig} if synthetic else {})
+    configs = {"config": None} | parts_from_json(table, kinds)
+    places = {name: array for name, array in arrays.items() if name in PROVENANCE_ARRAYS}
+    provenance = Provenance.from_json(table["provenance"], **places) if "provenance" in table else None
+    parts: dict[str, Any] = configs | {name: arrays[name] for name in ARRAYS}
+    return Dataset(**parts, provenance=provenance)
+
+
+def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = None) -> None:
+    """Writes the data set to a folder, whole or not at all; a data set that lies there is replaced.
+
+    on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
+    or when it cannot be written: a full disk, no permission.
+    """
+    with folder_written_whole(user_path(folder), is_dataset) as temporary:
+        arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
+        files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
+        table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
+        (temporary / "dataset.json").write_text(json.dumps(table | {"sha256": digest(table)}, indent=1) + "\n")
+
+
+def load(folder: str | Path) -> Dataset:
+    """Reads a data set that `save` wrote.
+
+    Raises InputError, which names folder, file and what is wrong, when something is missing, truncated or altered,
+    of another format version, or does not fit together.
+    """
+    folder = user_path(folder)
+    put_back(folder)
+    require(folder.is_dir(), "data set", str(folder), "a folder that travjax wrote; there is none")
+    path = folder / "dataset.json"
+    table = read_table(path)
+    names = ARRAYS + (PROVENANCE_ARRAYS if "provenance" in table else ())
+    for name, (size, checksum) in files_of(table, names, path).items():
+        _verify(folder / name, size, checksum)
+    arrays = {name: _read_array(folder / f"{name}.npy") for name in names}
+    try:
+        with naming(folder):
+            return put_together(table, arrays)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from None
+
+
+def _read_array(path: Path) -> np.ndarray:
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that are not NumPy's own
+            array = np.load(file, allow_pickle=False)
+    except Exception as error:  # NumPy raises all sorts over what is no array
+        reason = str(error).partition(". ")[0] or type(error).__name__
+        raise InputError(f"{path}: cannot be read as an array: {reason}") from None
+    require(isinstance(array, np.ndarray), str(path), type(array).__name__, "a .npy file of one array")
+    return array
+
+
+def _verify(path: Path, size: int, expected: str) -> None:
+    try:
+        found = path.stat().st_size
+        if found != size:
+            raise InputError(f"{path}: {found} bytes: must be {size}; it was truncated or overwritten")
+        digest = sha256(path)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
+    if digest != expected:
+        raise InputError(f"{path}: has been altered: its SHA-256 is {digest[:12]}..., and was {expected[:12]}...")
+
+
+class _Hashing:
+    """A file to write to that hashes and counts what goes through it."""
+
+    def __init__(self, file, on_progress: Progress | None):
+        self.file, self.on_progress = file, on_progress
+        self.sha256, self.bytes = hashlib.sha256(), 0
+
+    def write(self, data: bytes) -> None:
+        self.file.write(data)
+        self.sha256.update(data)
+        self.bytes += len(data)
+        if self.on_progress:
+            self.on_progress(len(data))
+
+
+def _write(path: Path, array: np.ndarray, on_progress: Progress | None) -> dict[str, Any]:
+    """Writes a .npy file piece by piece; returns its size and checksum."""
+    with path.open("wb") as file:
+        hashing = _Hashing(file, on_progress)
+        np.lib.format.write_array(hashing, array, allow_pickle=False)
+    return {"bytes": hashing.bytes, "sha256": hashing.sha256.hexdigest()}
+
+
+def is_dataset(folder: Path) -> bool:
+    """Whether the folder holds a data set of any version and nothing else."""
+    try:
+        table = read_json(folder / "dataset.json")
+        ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS + PROVENANCE_ARRAYS)}
+        described = isinstance(table, dict) and table.get("format") == FORMAT
+        return described and {path.name for path in folder.iterdir()} <= ours
+    except (OSError, InputError):
+        return False

@@ -1,0 +1,95 @@
+"""Batches of maps with where they come from, their labels, and which of them to show.
+
+A batch is a dict of arrays with a common leading axis: `heights` [n, rows, cols] and `group` [n] (style or file), what
+else tells its maps apart, and, once labelled, the margins, `known` and `failed`.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from travjax.batching import BATCH
+from travjax.config import one_line, require
+from travjax.data.dem import Windows
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import failures, simulate
+from travjax.terrain.styles import FIELDS, elevation, sample_params
+
+Batch = dict[str, np.ndarray]
+
+
+def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: float | None = None) -> Iterator[Batch]:
+    """Maps of the styles and seeds [n] in a world, with the parameters and noise seeds that make them again."""
+    for start in range(0, len(seeds), BATCH):
+        names, numbers = styles[start : start + BATCH], seeds[start : start + BATCH]
+        params, noise_seeds = sample_params(names, numbers)
+        yield {
+            "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
+            "group": np.array(names),
+            "seed": np.array(numbers),
+            "noise_seed": np.asarray(noise_seeds),
+            **{field: np.asarray(getattr(params, field)) for field in FIELDS},
+        }
+
+
+def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
+    """The windows of named sites, with where on the site each lies."""
+    for name, windows in sites:
+        for start in range(0, len(windows), BATCH):
+            some = slice(start, start + BATCH)
+            heights = windows.read(some)
+            yield {
+                "heights": heights,
+                "group": np.full(len(heights), name),
+                "origin": windows.origins[some],
+                "height_offset": windows.offsets(some),
+                "crs": windows.systems(some),
+            }
+
+
+def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Batch:
+    """The batch with `step`, `obstacle`, `tilt` and `known` [n, t] and `failed` [n, t, 3].
+
+    Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
+    """
+    margins = simulate(batch["heights"], robot, actions, grid=grid)
+    numbers = np.isfinite(np.asarray(margins.events())).all(axis=-1)
+    allowed = "finite where the ground is known"
+    require(bool((numbers | ~np.asarray(margins.known)).all()), f"margins of {robot.name}", "NaN or infinity", allowed)
+    arrays = dataclasses.asdict(margins) | {"failed": failures(margins, robot)}
+    return batch | {name: np.asarray(array) for name, array in arrays.items()}
+
+
+def bytes_each(actions: ActionSpace, grid: Grid) -> int:
+    """Returns how much a labelled map takes: heights, three margins, `known` and three flags a trajectory."""
+    return 4 * grid.nodes**2 + len(actions) * (3 * 4 + 1 + 3)
+
+
+def joined(batches: list[Batch]) -> Batch:
+    """All batches as one."""
+    return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
+
+
+def samples(maps: Batch, most: int = 5) -> np.ndarray:
+    """Indices of labelled maps to show: the groups in turn and spread over each.
+
+    Those come first that fail neither nowhere nor everywhere.
+    """
+    fails = (maps["failed"].any(axis=-1) & maps["known"]).mean(axis=-1)
+    dull = (fails < 0.05) | (fails > 0.6)
+    spread = np.arange(len(fails)) * 0.618034 % 1  # the smallest few of these lie far apart
+    groups: dict[str, list[int]] = {}
+    for index in np.lexsort((spread, dull)):
+        groups.setdefault(maps["group"][index], []).append(int(index))
+    in_turn = sorted((rank, index) for members in groups.values() for rank, index in enumerate(members))
+    return np.array([index for _, index in in_turn[:most]])
+
+
+def title(maps: Batch, index: int) -> str:
+    """One line that tells a map from the others: its group, and its seed or south-west corner."""
+    seed = "seed" in maps
+    where = f"seed {maps['seed'][index]}" if seed else "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])
+    return f"{one_line(maps['group'][index], 30)}, {where}"

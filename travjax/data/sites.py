@@ -1,0 +1,281 @@
+"""Real maps as a data set: windows of sites, split so that no ground is trained on and tested on (SPEC section 11).
+
+What becomes of a window is decided in this order:
+1. Windows with too many unknown nodes or without any known trajectory are left out.
+2. Windows of test sites, and those that lie wholly in a test strip, are for the test.
+3. Other windows nearer than the gap to a test window of the same ground are left out.
+4. Windows of validation sites, and those that lie wholly in a validation strip, are for validation.
+5. Other windows that share ground with a validation window, be it the nodes of an edge, are left out.
+6. The rest is for training, and is also turned by 90, 180 and 270 degrees and labelled anew.
+
+Where windows lie is compared in their coordinates where files name the same system, and on the planet where they name
+two, with some metres of doubt. Local systems, and none, say nothing about that: each such file is a ground of its own.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from travjax.config import InputError
+from travjax.data.dataset import CHUNK, Dataset, Progress
+from travjax.data.dem import Windows, load_dem
+from travjax.data.provenance import SPLITS, Provenance, Site, SiteRecord, SitesConfig, Strip
+from travjax.data.sampling import UNKNOWN
+from travjax.files import find_data
+from travjax.rasters.coordinates import is_local, places
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.footprint import node_table
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import failures, packed, simulate
+
+TRAIN, VALIDATION, TEST, TOO_UNKNOWN, NEAR_TEST, SHARED = FATES = range(6)
+"""What becomes of a window: the first three are the index into SPLITS."""
+
+LEFT_OUT = {TOO_UNKNOWN: "too_unknown", NEAR_TEST: "near_test", SHARED: "shared"}
+"""Why a window is left out, as SiteRecord names it."""
+
+TOLERANCE = 1e-6
+"""Metres by which places of windows may be off."""
+
+DOUBT = 10.0
+"""Metres by which places of two coordinate systems may be off: by realisations of a frame, or for want of grids."""
+
+
+def read(
+    config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
+) -> Dataset:
+    """Cuts, labels and splits the windows of the sites; those of a site follow each other, turned copies come last.
+
+    on_progress is called with the number of maps that were labelled. Raises InputError when robot, actions and grid do
+    not fit together, when a file is missing, cannot be read or is given twice, and when no window of a site is left for
+    a split that was asked for.
+    """
+    node_table(robot, actions, grid)
+    found = [_windows(site, config, grid) for site in config.site]
+    _require_different(found)
+    label = lambda heights: _labels(heights, robot, actions, grid, on_progress)
+    windows = _Candidates(found)
+    labels = np.full((len(windows.site), len(actions)), UNKNOWN, np.uint8)
+    for some, heights in windows.batches():
+        enough = np.isnan(heights).mean(axis=(1, 2)) <= config.max_unknown
+        labels[some[enough]] = label(heights[enough])
+    fate = _fates(config, windows, labels.min(axis=1) < UNKNOWN, grid.size)
+    records = _records(config, found, windows.site, fate)
+    _require_all(config, records, found, grid.size)
+
+    kept = np.flatnonzero(fate <= TEST)
+    copied = np.flatnonzero(fate == TRAIN) if config.rotations else kept[:0]
+    source = np.concatenate([kept, *[copied] * 3])
+    turns = np.repeat(np.arange(4, dtype=np.uint8), [len(kept), *[len(copied)] * 3])
+    heights = np.empty((len(source), *grid.shape), np.float32)
+    heights[: len(kept)] = windows.read(kept)
+    for quarter in (1, 2, 3):
+        heights[turns == quarter] = turned(heights[np.searchsorted(kept, copied)], quarter)
+    return Dataset(
+        heights=heights,
+        labels=np.concatenate([labels[kept], label(heights[len(kept) :])]),
+        group=np.array([site.group for site in config.site])[windows.site[source]],
+        seed=np.zeros(len(source), np.uint32),
+        split=fate[source],
+        robot=robot,
+        actions=actions,
+        grid=grid,
+        config=None,
+        provenance=Provenance(windows.origin[source], turns, config, records),
+    )
+
+
+def turned(heights: np.ndarray, quarter_turns: int) -> np.ndarray:
+    """Maps [..., rows, cols] turned anticlockwise about their centre, x to the east and y to the north."""
+    return np.rot90(heights, -quarter_turns, axes=(-2, -1))  # rows go north, so the other way round than printed
+
+
+@dataclass(frozen=True, eq=False)
+class _Candidates:
+    """The windows of all sites.
+
+    found: of each site
+    """
+
+    found: list[Windows]
+
+    @cached_property
+    def origin(self) -> np.ndarray:
+        return np.concatenate([windows.origins for windows in self.found])
+
+    @cached_property
+    def site(self) -> np.ndarray:
+        """Index of the site of each: [n]."""
+        return np.repeat(np.arange(len(self.found)), [len(windows) for windows in self.found])
+
+    @cached_property
+    def system(self) -> np.ndarray:
+        """The coordinate system of each by its name, and a name of the site's own where it is local: [n]."""
+        names = np.concatenate([windows.systems() for windows in self.found]).astype(object)
+        own = [index for index, name in enumerate(names) if is_local(name or None)]
+        names[own] = [f"site {site}" for site in self.site[own]]
+        return names
+
+    def batches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Yields the indices and the heights of some windows at a time, [k] and [k, rows, cols]."""
+        first = 0
+        for windows in self.found:
+            for start in range(0, len(windows), CHUNK):
+                heights = windows.read(slice(start, start + CHUNK))
+                yield first + start + np.arange(len(heights)), heights
+            first += len(windows)
+
+    def read(self, which: np.ndarray) -> np.ndarray:
+        """Returns the heights of some windows, [k, rows, cols]; which: [k] in rising order."""
+        sites = self.site[which]
+        first = np.cumsum([0, *(len(windows) for windows in self.found)])
+        return np.concatenate([self.found[one].read(which[sites == one] - first[one]) for one in np.unique(sites)])
+
+    def places(self, size: float) -> dict[float, tuple[np.ndarray, np.ndarray]]:
+        """Returns the middles of all windows that lie on a planet, by its radius: indices [k] and metres [k, 3]."""
+        found: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
+        for name in dict.fromkeys(self.system):
+            if not name.startswith("site "):
+                here = np.flatnonzero(self.system == name)
+                planet, xyz = places(name, *(self.origin[here] + size / 2).T)
+                found.setdefault(planet, []).append((here, xyz))
+        return {
+            planet: (np.concatenate([here for here, _ in parts]), np.concatenate([xyz for _, xyz in parts]))
+            for planet, parts in found.items()
+        }
+
+
+def _windows(site: Site, config: SitesConfig, grid: Grid) -> Windows:
+    path = find_data(site.file, f"site {site.group}: file")
+    return load_dem(
+        path,
+        config.stride,
+        grid=grid,
+        cell_size=site.cell_size,
+        height_scale=site.height_scale,
+        nodata=site.nodata,
+        band=site.band,
+        classes=site.classes,
+        up=site.up,
+        gdal_drivers=site.gdal_drivers,
+        fill_holes=config.fill_holes,
+        allow_coarse=config.allow_coarse,
+    )
+
+
+def _require_different(found: list[Windows]) -> None:
+    first: dict[str, str] = {}
+    for windows in found:
+        if windows.sha256 in first:
+            raise InputError(f"{windows.path}: holds the same as {first[windows.sha256]}: must be given once")
+        first[windows.sha256] = windows.path
+
+
+def _labels(
+    heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None
+) -> np.ndarray:
+    """The labels of maps: [n, t] uint8."""
+    labels = np.empty((len(heights), len(actions)), np.uint8)
+    for start in range(0, len(heights), CHUNK):
+        chunk = slice(start, min(start + CHUNK, len(heights)))
+        margins = simulate(heights[chunk], robot, actions, grid=grid)
+        labels[chunk] = packed(failures(margins, robot), margins.known)
+        if on_progress:
+            on_progress(chunk.stop - start)
+    return labels
+
+
+def _fates(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: float) -> np.ndarray:
+    """What becomes of each window: [n] uint8, one of FATES. known: [n] whether any trajectory is."""
+    fate = np.full(len(known), TRAIN, np.uint8)
+    asked = {split: _asked_for(split, config, windows, size) for split in ("validation", "test")}
+    fate[~known] = TOO_UNKNOWN
+    fate[known & asked["test"]] = TEST
+    fate[(fate == TRAIN) & _near(windows, fate == TEST, size, size + config.gap - TOLERANCE)] = NEAR_TEST
+    fate[(fate == TRAIN) & asked["validation"]] = VALIDATION
+    fate[(fate == TRAIN) & _near(windows, fate == VALIDATION, size, size + TOLERANCE)] = SHARED
+    return fate
+
+
+def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: float) -> np.ndarray:
+    """Windows of sites for that split and windows in its strips: [n] bool."""
+    asked = np.zeros(len(windows.site), bool)
+    for index, site in enumerate(config.site):
+        members = windows.site == index
+        inside = _in_strip(windows.origin[members], site.strips[split], size)
+        asked[members] = inside | (site.split == split)
+    return asked
+
+
+def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
+    """Which windows [n, 2] of a site lie wholly in a strip along the outermost of them: [n] bool."""
+    if not strip:
+        return np.zeros(len(origin), bool)
+    side, metres = strip
+    along = origin[:, 0 if side in ("east", "west") else 1]
+    beyond = along - along.min() if side in ("south", "west") else along.max() - along
+    return beyond + size <= metres + TOLERANCE
+
+
+def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -> np.ndarray:
+    """Which windows have one of the `others` [n] bool on the same ground within reach: [n] bool.
+
+    size:  of a window
+    reach: between the south-west nodes along the axis in which they lie farther apart; the size is where windows touch
+    """
+    from scipy.spatial import KDTree  # takes 0.2 s to import
+
+    near = np.zeros(len(others), bool)
+    for system in dict.fromkeys(windows.system[others]):
+        here = windows.system == system
+        distance, _ = KDTree(windows.origin[here & others]).query(windows.origin[here], p=np.inf)
+        near[here] = distance < reach
+    if len(dict.fromkeys(windows.system)) == 1:
+        return near
+    apart = reach + (np.sqrt(2) - 1) * size + DOUBT  # between middles, whichever way the windows are turned
+    for index, xyz in windows.places(size).values():
+        held = others[index]
+        for system in dict.fromkeys(windows.system[index[held]]):
+            own = windows.system[index] == system
+            distance, _ = KDTree(xyz[held & own]).query(xyz[~own])
+            near[index[~own]] |= distance < apart
+    return near
+
+
+def _records(config: SitesConfig, found: list[Windows], site: np.ndarray, fate: np.ndarray) -> tuple[SiteRecord, ...]:
+    names = dict(enumerate(SPLITS)) | LEFT_OUT
+    read = ("sha256", "cell_size", "covered", "filled", "unknown")
+
+    def records() -> Iterator[SiteRecord]:
+        for index, windows in enumerate(found):
+            counts = np.bincount(fate[site == index], minlength=len(FATES)).tolist()
+            fates = {names[one]: count for one, count in enumerate(counts)}
+            as_read: dict[str, Any] = {name: getattr(windows, name) for name in read}
+            as_read["crs"] = ", ".join(dict.fromkeys(windows.systems())) or None
+            as_read["height_offset"] = windows.height_offset if isinstance(windows.height_offset, float) else None
+            site_of = config.site[index]
+            yield SiteRecord(site_of.group, site_of.file, **as_read, windows=sum(counts), **fates)
+
+    return tuple(records())
+
+
+def _require_all(config: SitesConfig, records: tuple[SiteRecord, ...], found: list[Windows], size: float) -> None:
+    """Refuses a split that was asked for and has no window, saying what became of the site's."""
+    for site, record, windows in zip(config.site, records, found, strict=True):
+        strips = {split: strip for split, strip in site.strips.items() if strip}
+        for split in dict.fromkeys([*strips, site.split]):
+            if getattr(record, split):
+                continue
+            east, north = np.ptp(windows.origins, axis=0) + size
+            strip = strips.get(split)
+            what = f"{split}_strip = {strip[0]} {strip[1]:g} m" if strip else f"split = {split}"
+            kept = ", ".join(f"{getattr(record, other)} {other}" for other in SPLITS if other != split)
+            raise InputError(
+                f"site {site.group}: {what}: must leave at least one of {record.windows} windows, which are {size:g} m "
+                f"and span {east:g} x {north:g} m; now {kept}, {record.too_unknown} left out as unknown, "
+                f"{record.near_test} near the test, {record.shared} sharing ground with validation"
+            )

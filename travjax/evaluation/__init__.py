@@ -1,0 +1,5 @@
+"""Scores, tables and figures.
+
+In: labels and predictions. Out: metrics, text, pictures, and how fast simulator and terrain are.
+Stands on matplotlib, which is imported where it is used, data/ and simulation/.
+"""

@@ -1,0 +1,72 @@
+"""A predictor to beat that knows no wheels: a logistic regression on two numbers of the ground along the path."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
+
+from travjax.data.sampling import Samples
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+
+CHUNK = 4096
+
+
+def slope_and_step(
+    heights: Float[np.ndarray, "n rows cols"], samples: Samples, actions: ActionSpace, grid: Grid
+) -> Float[np.ndarray, "k 2"]:
+    """Largest slope [rad] of the ground along the path, and largest change of its height from pose to pose [m].
+
+    Both at the nodes nearest to the robot's centre; unknown ground does not count.
+    """
+    place = np.floor(actions.poses(np.arange(len(actions)))[..., :2] / grid.spacing + grid.cells / 2 + 0.5).astype(int)
+    result = np.empty((len(samples[0]), 2))
+    for start in range(0, len(result), CHUNK):
+        part = slice(start, start + CHUNK)
+        maps, which = np.unique(samples[0][part], return_inverse=True)
+        chosen = heights[maps].astype(np.float64)
+        slope = np.hypot(*np.gradient(chosen, grid.spacing, axis=(1, 2)))
+        col, row = np.moveaxis(place[samples[1][part]], -1, 0)
+        slopes, ground = (field[which[:, None], row, col] for field in (slope, chosen))
+        result[part, 0] = np.nan_to_num(np.arctan(slopes)).max(axis=1)
+        result[part, 1] = np.nan_to_num(np.abs(np.diff(ground, axis=1))).max(axis=1)
+    return result
+
+
+@dataclass(frozen=True)
+class LogisticRegression:
+    """Probability of each event from features [k, f]: sigmoid(weights . features / scale + bias).
+
+    weights: [3, f + 1], the bias last; scale: [f] standard deviations of the training features
+    """
+
+    weights: np.ndarray
+    scale: np.ndarray
+
+    @staticmethod
+    def fit(features: Float[np.ndarray, "k f"], failed: Bool[np.ndarray, "k 3"]) -> "LogisticRegression":
+        """Of the largest likelihood, with a penalty too small to matter where the events are not separable."""
+        scale = np.maximum(features.std(axis=0), 1e-9)
+        inputs = _with_one(features / scale)
+
+        def loss(weights, target):
+            logits = inputs @ weights
+            value = np.logaddexp(0, logits).mean() - (logits * target).mean() + 1e-6 * weights @ weights
+            return value, inputs.T @ (_sigmoid(logits) - target) / len(inputs) + 2e-6 * weights
+
+        start = np.zeros(inputs.shape[1])
+        fitted = [minimize(loss, start, args=(target,), jac=True, method="L-BFGS-B").x for target in failed.T * 1.0]
+        return LogisticRegression(np.array(fitted), scale)
+
+    def probabilities(self, features: Float[np.ndarray, "k f"]) -> Float[np.ndarray, "k 3"]:
+        """Probability of each event."""
+        return _sigmoid(_with_one(features / self.scale) @ self.weights.T)
+
+
+def _with_one(features: np.ndarray) -> np.ndarray:
+    return np.concatenate([features, np.ones((len(features), 1))], axis=1)
+
+
+def _sigmoid(logits: np.ndarray) -> np.ndarray:
+    return 0.5 * (1 + np.tanh(logits / 2))

@@ -1,0 +1,345 @@
+"""How good predicted probabilities are: confusion, recall, average precision, calibration (SPEC section 10).
+
+A sample is predicted to fail where its probability is at least the threshold, here and in everything that is printed.
+Probabilities and failures are [s, 3], events in the order of EVENTS; "overall" pools the three events (micro-average).
+Where no sample fails, recall, precision, F1 and average precision are undefined: NaN. Only NumPy is needed.
+"""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from travjax.config import require, require_number
+from travjax.simulation.traverse import EVENTS
+
+OVERALL = "overall"
+NAMES = (*EVENTS, OVERALL)
+THRESHOLD = 0.5
+CURVE_POINTS = 300
+"""Points of a precision-recall curve that an Evaluation keeps."""
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """Counts of safe samples that are predicted safe (tn) or to fail (fp), and of failures likewise (fn, tp)."""
+
+    tn: int
+    fp: int
+    fn: int
+    tp: int
+
+    def __add__(self, other: "Confusion") -> "Confusion":
+        return Confusion(self.tn + other.tn, self.fp + other.fp, self.fn + other.fn, self.tp + other.tp)
+
+    @property
+    def samples(self) -> int:
+        return self.tn + self.fp + self.fn + self.tp
+
+    @property
+    def failures(self) -> float:
+        """Share of the samples that fail."""
+        return _ratio(self.fn + self.tp, self.samples)
+
+    @property
+    def accuracy(self) -> float:
+        return _ratio(self.tn + self.tp, self.samples)
+
+    @property
+    def recall(self) -> float:
+        return _ratio(self.tp, self.fn + self.tp)
+
+    @property
+    def precision(self) -> float:
+        """NaN where nothing is predicted to fail, and where nothing fails, as the paper leaves it out there."""
+        return _ratio(self.tp, self.fp + self.tp) if self.fn + self.tp else math.nan
+
+    @property
+    def f1(self) -> float:
+        return _ratio(2 * self.tp, 2 * self.tp + self.fp + self.fn) if self.fn + self.tp else math.nan
+
+
+FIGURES = ("accuracy", "recall", "precision", "f1", "failures")
+"""What a confusion says, by the names of its properties."""
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else math.nan
+
+
+def with_overall(confusions: Mapping[str, Confusion]) -> dict[str, Confusion]:
+    """The confusions of the events and "overall", their sum."""
+    total = sum((confusions[event] for event in EVENTS), Confusion(0, 0, 0, 0))
+    return {**{event: confusions[event] for event in EVENTS}, OVERALL: total}
+
+
+PAPER_SYNTHETIC = with_overall(
+    {
+        "step": Confusion(3126951, 113457, 13615, 201689),
+        "obstacle": Confusion(3211837, 53842, 9644, 180389),
+        "tilt": Confusion(3425479, 15806, 163, 14264),
+    }
+)
+"""The paper's synthetic test set (SPEC section 10)."""
+
+PAPER_REAL = with_overall(
+    {
+        "step": Confusion(132880, 811, 109, 48),
+        "obstacle": Confusion(132622, 521, 269, 436),
+        "tilt": Confusion(133735, 113, 0, 0),
+    }
+)
+"""The paper's 44 real maps, with the network that was transferred to them."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Precision and recall at every threshold where the recall changes: the distinct probabilities of the failures.
+
+    threshold: [k] falling; precision, recall: [k], recall rising to 1. Empty where no sample fails.
+    """
+
+    threshold: Float[np.ndarray, " k"]
+    precision: Float[np.ndarray, " k"]
+    recall: Float[np.ndarray, " k"]
+
+    @property
+    def average_precision(self) -> float:
+        """Mean precision over the recall, without interpolation: sum of (recall gained) x precision. NaN if empty."""
+        if not len(self.recall):
+            return math.nan
+        return float(np.diff(self.recall, prepend=0) @ self.precision)
+
+    def threshold_for_recall(self, recall: float) -> float:
+        """The highest threshold that reaches the recall; NaN where no sample fails."""
+        require_number("recall", recall, 0, 1, "a share above 0 and at most 1")
+        if not len(self.recall):
+            return math.nan
+        return float(self.threshold[np.searchsorted(self.recall, recall)])
+
+    def thinned(self, points: int = CURVE_POINTS) -> "Curve":
+        """At most that many of its points, spread over it, both ends kept."""
+        last = len(self.recall) - 1
+        kept = np.unique(np.linspace(0, last, min(points, last + 1)).round().astype(int))
+        return Curve(self.threshold[kept], self.precision[kept], self.recall[kept])
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Predicted against observed: samples in bins of equal width by their probability.
+
+    count: [b] samples; probability: [b] their mean probability; observed: [b] the share that fails. NaN where empty.
+    """
+
+    count: Int[np.ndarray, " b"]
+    probability: Float[np.ndarray, " b"]
+    observed: Float[np.ndarray, " b"]
+
+    @property
+    def edges(self) -> np.ndarray:
+        """[b + 1] bounds of the bins; a probability on a bound belongs to the bin above it, 1 to the last one."""
+        return np.linspace(0, 1, len(self.count) + 1)
+
+    @property
+    def error(self) -> float:
+        """The expected calibration error (ECE): mean distance of probability and observed share over the samples."""
+        distance = np.abs(self.probability - self.observed)
+        return float(np.nansum(self.count * distance) / self.count.sum())
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Of one event, or overall: the confusion at the threshold, and the average precision."""
+
+    confusion: Confusion
+    average_precision: float
+
+
+@dataclass(frozen=True)
+class OperatingPoint:
+    """The highest threshold that reaches the wanted recall, and the confusion there."""
+
+    wanted: float
+    threshold: float
+    confusion: Confusion
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All that is known of one predictor on one set of samples; the dicts go by event and "overall".
+
+    any_failure: share of the samples with any failure; curves keep CURVE_POINTS points
+    points:      operating points for each wanted recall and for the paper's own, by rising recall
+    groups:      for each group of samples its scores by event and "overall"
+    """
+
+    samples: int
+    any_failure: float
+    threshold: float
+    scores: dict[str, Scores]
+    curves: dict[str, Curve]
+    points: dict[str, tuple[OperatingPoint, ...]]
+    calibration: dict[str, Calibration]
+    groups: dict[str, dict[str, Scores]] = field(default_factory=dict)
+
+    @property
+    def average_precision(self) -> dict[str, float]:
+        """By event, "overall", and "mean" over the events of which there are failures."""
+        by_name = {name: scores.average_precision for name, scores in self.scores.items()}
+        defined = [by_name[event] for event in EVENTS if not math.isnan(by_name[event])]
+        return {**by_name, "mean": _ratio(sum(defined), len(defined))}
+
+    @property
+    def f1(self) -> dict[str, float]:
+        """By event and "overall"."""
+        return {name: scores.confusion.f1 for name, scores in self.scores.items()}
+
+
+def confusion(probabilities: np.ndarray, failed: np.ndarray, threshold: float = THRESHOLD) -> Confusion:
+    """Counts all samples of arrays of one shape together; predicted to fail is probability >= threshold."""
+    predicted = probabilities >= threshold
+    positive = int(np.count_nonzero(predicted))
+    tp = int(np.count_nonzero(predicted & failed))
+    fn = int(np.count_nonzero(failed)) - tp
+    return Confusion(failed.size - positive - fn, positive - tp, fn, tp)
+
+
+def confusions(
+    probabilities: Float[np.ndarray, "s 3"],
+    failed: Bool[np.ndarray, "s 3"],
+    threshold: float | Sequence[float] = THRESHOLD,
+) -> dict[str, Confusion]:
+    """The confusion of each event, and overall; `threshold` is one for all or one an event."""
+    thresholds = np.broadcast_to(threshold, len(EVENTS)).tolist()
+    return with_overall(
+        {name: confusion(probabilities[:, e], failed[:, e], thresholds[e]) for e, name in enumerate(EVENTS)}
+    )
+
+
+def precision_recall_curve(probabilities: np.ndarray, failed: np.ndarray) -> Curve:
+    """The curve of all samples of arrays of one shape together; equal probabilities pass a threshold together."""
+    failures, safe = np.sort(probabilities[failed]), np.sort(probabilities[~failed])
+    threshold = np.unique(failures)[::-1]
+    tp = len(failures) - np.searchsorted(failures, threshold)
+    fp = len(safe) - np.searchsorted(safe, threshold)
+    return Curve(threshold, tp / (tp + fp), tp / max(len(failures), 1))
+
+
+def average_precision(probabilities: np.ndarray, failed: np.ndarray) -> float:
+    """Average precision (scikit-learn's definition) of all samples of two arrays of one shape; NaN if none fails."""
+    return precision_recall_curve(probabilities, failed).average_precision
+
+
+def threshold_for_recall(probabilities: np.ndarray, failed: np.ndarray, recall: float) -> float:
+    """The highest threshold at which probability >= threshold finds that share of the failures; NaN if none fails."""
+    return precision_recall_curve(probabilities, failed).threshold_for_recall(recall)
+
+
+def calibration(probabilities: np.ndarray, failed: np.ndarray, bins: int = 10) -> Calibration:
+    """Bins all samples of arrays of one shape together."""
+    probability = np.ravel(probabilities).astype(np.float64)
+    number = np.minimum((probability * bins).astype(np.int64), bins - 1)
+    count = np.bincount(number, minlength=bins)
+    total = np.bincount(number, probability, minlength=bins)
+    fails = np.bincount(number[np.ravel(failed)], minlength=bins)
+    samples = np.where(count, count, np.nan)
+    return Calibration(count, total / samples, fails / samples)
+
+
+def evaluate(
+    probabilities: Float[np.ndarray, "s 3"],
+    failed: Bool[np.ndarray, "s 3"],
+    groups: Sequence[str] | np.ndarray | None = None,
+    *,
+    recalls: Sequence[float] = (0.9, 0.99),
+    paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
+    threshold: float = THRESHOLD,
+) -> Evaluation:
+    """Everything about predicted probabilities [s, 3] of samples whose failures [s, 3] are known.
+
+    groups:  [s] the group of each sample, such as its style
+    recalls: those to find thresholds for, beside the recalls of `paper`
+    Raises InputError when shapes differ, there is no sample, or a probability is not from 0 to 1.
+    """
+    probabilities, failed = _checked(probabilities, failed)
+    columns = {name: (probabilities[:, e], failed[:, e]) for e, name in enumerate(EVENTS)}
+    columns[OVERALL] = (probabilities, failed)
+    curves = {name: precision_recall_curve(*column) for name, column in columns.items()}
+    counts = confusions(probabilities, failed, threshold)
+    wanted = {name: {*recalls, *_recall_of(paper, name)} for name in NAMES}
+    return Evaluation(
+        samples=len(failed),
+        any_failure=float(failed.any(axis=1).mean()),
+        threshold=threshold,
+        scores={name: Scores(counts[name], curves[name].average_precision) for name in NAMES},
+        curves={name: curve.thinned() for name, curve in curves.items()},
+        points={name: _points(*column, curves[name], wanted[name]) for name, column in columns.items()},
+        calibration={name: calibration(*column) for name, column in columns.items()},
+        groups={} if groups is None else _of_groups(probabilities, failed, groups, threshold),
+    )
+
+
+def _recall_of(paper: Mapping[str, Confusion] | None, name: str) -> set[float]:
+    """The recall that the paper prints, if any."""
+    return {round(paper[name].recall, 3)} if paper and paper[name].recall > 0 else set()
+
+
+def _points(probabilities, failed, curve: Curve, recalls: Iterable[float]) -> tuple[OperatingPoint, ...]:
+    points = [(recall, curve.threshold_for_recall(recall)) for recall in sorted(recalls)]
+    return tuple(OperatingPoint(*point, confusion(probabilities, failed, point[1])) for point in points)
+
+
+def _of_groups(probabilities, failed, groups, threshold: float) -> dict[str, dict[str, Scores]]:
+    members: np.ndarray = np.asarray(groups)
+    require(members.shape == failed.shape[:1], "groups", members.shape, f"one name for each of {len(failed)} samples")
+    return {str(name): _scores(probabilities[of], failed[of], threshold) for name, of in _masks(members)}
+
+
+def _masks(members: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
+    """Each name and where it stands, in the order in which they come first; names are few, so nothing is sorted."""
+    left = np.ones(len(members), bool)
+    while left.any():
+        name = members[left.argmax()]
+        of = members == name
+        left &= ~of
+        yield name, of
+
+
+def _scores(probabilities: np.ndarray, failed: np.ndarray, threshold: float) -> dict[str, Scores]:
+    precisions = [average_precision(probabilities[:, e], failed[:, e]) for e in range(len(EVENTS))]
+    precisions.append(average_precision(probabilities, failed))
+    counts = confusions(probabilities, failed, threshold)
+    return {name: Scores(counts[name], precision) for name, precision in zip(NAMES, precisions, strict=True)}
+
+
+def _checked(probabilities, failed) -> tuple[np.ndarray, np.ndarray]:
+    probabilities, failed = np.asarray(probabilities), np.asarray(failed)
+    allowed = f"[s, {len(EVENTS)}], at least one sample"
+    require(failed.ndim == 2 and failed.shape[1] == len(EVENTS) and len(failed) > 0, "failed", failed.shape, allowed)
+    require(failed.dtype == bool, "failed", failed.dtype, "of dtype bool")
+    require(probabilities.shape == failed.shape, "probabilities", probabilities.shape, f"{failed.shape}, as failed is")
+    probabilities = probabilities.astype(np.result_type(probabilities, np.float32), copy=False)
+    wrong = ~((probabilities >= 0) & (probabilities <= 1))
+    require(not wrong.any(), "probabilities", probabilities[wrong][:1].tolist(), "from 0 to 1")
+    return probabilities, failed
+
+
+def to_json(value):
+    """An Evaluation, or any part of one, as plain dicts, lists and numbers; what is not finite is None.
+
+    A confusion brings the figures of its counts, a calibration its error, an evaluation its average precisions.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        return to_json(value.tolist())
+    if dataclasses.is_dataclass(value):
+        derived = {Confusion: FIGURES, Calibration: ("error",), Evaluation: ("average_precision",)}
+        names = [*(entry.name for entry in dataclasses.fields(value)), *derived.get(type(value), ())]
+        return {name: to_json(getattr(value, name)) for name in names}
+    if isinstance(value, Mapping):
+        return {name: to_json(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

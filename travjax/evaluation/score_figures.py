@@ -1,0 +1,292 @@
+"""Figures of evaluation and training: precision and recall, calibration, training curves, network inputs.
+
+Functions return a matplotlib Figure; `plots.save` writes it.
+"""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from itertools import cycle, pairwise
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from travjax.config import one_line
+from travjax.evaluation.metrics import NAMES, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
+from travjax.evaluation.transfer_scores import Results
+from travjax.simulation.grid import Grid
+
+COLOURS = dict(zip(NAMES, ("tab:blue", "tab:orange", "tab:purple", "black"), strict=True))
+BASELINES = ("tab:brown", "tab:olive", "tab:cyan", "tab:pink", "tab:gray")
+
+
+def precision_recall_figure(
+    evaluation: Evaluation,
+    paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
+    baselines: Mapping[str, Evaluation] | None = None,
+) -> Figure:
+    """Precision against recall of each event and overall, over lines of equal F1.
+
+    Marked are the threshold of the evaluation and where the paper stands. baselines: other predictors by name.
+    """
+    figure = Figure(figsize=(13.5, 9), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    for ax, name in zip(axes.flat, NAMES, strict=True):
+        _draw_equal_f1(ax)
+        for colour, (other, one) in zip(cycle(BASELINES), (baselines or {}).items(), strict=False):
+            _draw_curve(ax, one.curves[name], one.scores[name].average_precision, other, color=colour, linewidth=1.2)
+        scores = evaluation.scores[name]
+        _draw_curve(ax, evaluation.curves[name], scores.average_precision, "network", color=COLOURS[name], linewidth=2)
+        _draw_point(ax, scores.confusion, "o", COLOURS[name], f"network at {evaluation.threshold:g}")
+        if paper:
+            _draw_point(ax, paper[name], "*", "red", "paper")
+        ax.set_title(f"{name}: {scores.confusion.failures:.2%} of {scores.confusion.samples:,} fail", fontsize=10)
+        ax.set(xlim=(0, 1.01), ylim=(0, 1.01))
+        ax.legend(loc="upper left", bbox_to_anchor=(1.12, 1), fontsize=8, frameon=False)
+    for ax in axes[-1]:
+        ax.set_xlabel("recall")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("precision")
+    return figure
+
+
+def _draw_equal_f1(ax) -> None:
+    for f1 in (0.2, 0.4, 0.6, 0.8):
+        recall = np.linspace(f1 / (2 - f1), 1, 100)
+        ax.plot(recall, f1 * recall / (2 * recall - f1), color="0.8", linewidth=0.8, zorder=0)
+        beside = dict(textcoords="offset points", va="center", annotation_clip=False)
+        ax.annotate(f"F1 {f1:g}", (1, f1 / (2 - f1)), (8, 0), fontsize=7, color="0.5", **beside)
+
+
+def _draw_curve(ax, curve: Curve, average_precision: float, label: str, **style) -> None:
+    """Steps, as average precision counts them: a precision holds for the recall gained to reach it."""
+    if len(curve.recall):
+        recall, precision = np.append(0, curve.recall), np.append(curve.precision[0], curve.precision)
+        name = textwrap.fill(f"{label}, AP {average_precision:.3f}", 28)
+        ax.step(recall, precision, where="pre", label=name, **style)
+    else:
+        ax.plot([], [], label=f"{label}: no sample fails", **style)
+
+
+def _draw_point(ax, counts: Confusion, marker: str, colour: str, label: str) -> None:
+    """Where a confusion stands; nothing where its precision or recall is undefined."""
+    if np.isfinite(counts.recall + counts.precision):
+        size = 12 if marker == "*" else 7
+        style = dict(color=colour, markersize=size, markeredgecolor="white", linestyle="none", clip_on=False, zorder=5)
+        ax.plot([counts.recall], [counts.precision], marker, label=label, **style)
+
+
+def reliability_figure(evaluation: Evaluation) -> Figure:
+    """Observed share of failures against predicted probability, of each event and overall; samples a bin below."""
+    figure = Figure(figsize=(14, 5.2), layout="constrained")
+    axes = figure.subplots(2, len(NAMES), sharex=True, sharey="row", height_ratios=(3, 1))
+    for (upper, lower), name in zip(axes.T, NAMES, strict=True):
+        bins = evaluation.calibration[name]
+        upper.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--")
+        filled = bins.count > 0
+        upper.plot(
+            bins.probability[filled], bins.observed[filled], "o-", color=COLOURS[name], markersize=4, clip_on=False
+        )
+        upper.set_title(f"{name}, calibration error {bins.error:.4f}", fontsize=10)
+        upper.set(xlim=(0, 1), ylim=(0, 1))
+        lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=COLOURS[name], alpha=0.7)
+        lower.set_yscale("log")
+        lower.set_xlabel("predicted probability")
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    axes[1, 0].set_ylim(bottom=0.5)
+    axes[0, 0].set_ylabel("observed share of failures")
+    axes[1, 0].set_ylabel("samples")
+    return figure
+
+
+def training_figure(rows: Sequence[Mapping]) -> Figure:
+    """Losses, average precision, F1 and learning rate against the training step.
+
+    rows: as read from metrics.jsonl, in order. Keys `step`, `phase`, `loss`, `validation_loss`, `learning_rate`, and
+    `average_precision` and `f1` by event; a row may lack any but `step`, and what is no number is not drawn.
+    """
+    figure = Figure(figsize=(12, 8), layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True)
+    (loss, precision), (rate, f1) = axes
+    _draw_series(loss, *_series(rows, "loss"), label="training", color="tab:blue", linewidth=1)
+    _draw_series(loss, *_series(rows, "validation_loss"), label="validation", color="tab:red", marker="o")
+    _draw_series(rate, *_series(rows, "learning_rate"), color="tab:green", drawstyle="steps-post")
+    for name, colour in COLOURS.items():
+        for ax, key in ((precision, "average_precision"), (f1, "f1")):
+            _draw_series(ax, *_series(rows, key, name), label=name, color=colour, marker="o")
+    titles = ("loss", "average precision, validation", "learning rate", f"F1 at {THRESHOLD:g}, validation")
+    for ax, title in zip(axes.flat, titles, strict=True):
+        ax.set_title(title, fontsize=10)
+        ax.grid(alpha=0.3)
+        _mark_phases(ax, rows)
+        if ax.get_legend_handles_labels()[0]:
+            ax.legend(fontsize=8)
+    for ax in (precision, f1):
+        ax.set_ylim(0, 1)
+    for ax in axes[-1]:
+        ax.set_xlabel("training step")
+    return figure
+
+
+def _series(rows: Sequence[Mapping], key: str, name: str | None = None) -> tuple[list, list]:
+    """Steps and values of the rows that have a number under the key, and under it the name."""
+    values = [(row["step"], row.get(key)) for row in rows]
+    if name is not None:
+        values = [(step, value.get(name)) for step, value in values if isinstance(value, Mapping)]
+    kept = [(step, value) for step, value in values if type(value) in (int, float)]
+    return [step for step, _ in kept], [value for _, value in kept]
+
+
+def _draw_series(ax, steps: list, values: list, **style) -> None:
+    if steps:
+        ax.plot(steps, values, markersize=4, **style)
+
+
+def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
+    """A line where a phase of training begins, and its number."""
+    for before, after in pairwise(row for row in rows if type(row.get("phase")) is int):
+        if before["phase"] != after["phase"]:
+            ax.axvline(before["step"], color="0.4", linewidth=1, linestyle=":")
+            ax.annotate(f"phase {after['phase']}", (before["step"], 1), (3, -10), **_PHASE)
+
+
+_PHASE = dict(xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8, color="0.4")
+
+
+def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
+    """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+
+    arms: their colours. Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
+    """
+    figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
+    for ax, site in zip(axes, results.sites, strict=True):
+        for arm in results.arms:
+            colour = arms[arm]
+            f1 = np.nan_to_num(results.f1(arm, site))
+            epochs = np.arange(f1.shape[1])
+            ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+            ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
+        always = results.always(site)
+        ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
+        ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
+        ax.set(xlabel="epoch on real maps", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    axes[0].legend(fontsize=9)
+    return figure
+
+
+def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid = Grid()) -> Figure:
+    """Network inputs, one sample a row: the three channels and the three as red, green and blue (the paper's Fig. 1).
+
+    images: [k, rows, cols, 3] as `inputs.render_inputs` makes them
+    """
+    figure = Figure(figsize=(12.5, 2.8 * len(images) + 0.6), layout="compressed")
+    axes = figure.subplots(len(images), 4, sharex=True, sharey=True, squeeze=False)
+    edge = grid.size / 2 + grid.spacing / 2
+    place = dict(origin="lower", extent=(-edge, edge, -edge, edge))
+    for row, image, title in zip(axes, images, titles, strict=True):
+        elevation = image[..., 0]
+        low, high = elevation.min(), max(elevation.max(), elevation.min() + 1e-3)
+        drawn = row[0].imshow(elevation, cmap="gray", vmin=low, vmax=high, **place)
+        figure.colorbar(drawn, ax=row[0], shrink=0.85)
+        for ax, channel in zip(row[1:3], (1, 2), strict=True):
+            drawn = ax.imshow(image[..., channel], cmap="gray", vmin=0, vmax=1, **place)
+        figure.colorbar(drawn, ax=row[2], shrink=0.85)
+        composite = np.concatenate([(elevation[..., None] - low) / (high - low), image[..., 1:]], axis=-1)
+        row[3].imshow(np.clip(composite, 0, 1), **place)
+        row[0].set_ylabel(f"{title}\ny, forward [m]", fontsize=9)
+    for ax, name in zip(
+        axes[0], ("elevation, from the robot's", "trajectory", "wheels", "as red, green, blue"), strict=True
+    ):
+        ax.set_title(name, fontsize=10)
+    for ax in axes[-1]:
+        ax.set_xlabel("x, right [m]")
+    return figure
+
+
+def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
+    """F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
+
+    f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
+    """
+    figure = Figure(figsize=(12.5, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.3))
+    names = list(next(iter(f1.values())))
+    noisy = [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    width = 0.8 / len(f1)
+    for number, (method, of) in enumerate(f1.items()):
+        colour = f"C{number}"
+        left.plot(noises, [of[others[0]], *(of[name] for name in noisy)], "o-", color=colour, label=method)
+        places = np.arange(len(others)) + (number - (len(f1) - 1) / 2) * width
+        bars = right.bar(places, [of[name] for name in others], width, color=colour)
+        right.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    left.set(xlabel="noise at each node [cm]", ylabel=f"F1 at {THRESHOLD:g}, events pooled", ylim=(0, 1.05))
+    right.set_xticks(range(len(others)), [name if name != others[0] else "clean" for name in others])
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    left.legend(fontsize=9)
+    return figure
+
+
+OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
+"""Colours that the colour-blind can tell apart (Okabe and Ito 2008)."""
+
+
+def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
+    """F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
+
+    f1:      by site, method and corruption: "none", "noise 2 cm", or another
+    methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
+    """
+    names = list(next(iter(next(iter(f1.values())).values())))
+    clean, noisy = names[0], [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    figure = Figure(figsize=(2.9 * len(f1) + 0.6, 6.2), layout="constrained")
+    axes = figure.subplots(2, len(f1), sharey=True, squeeze=False)
+    styles = list(zip(methods, OKABE_ITO, "osv^DP", cycle(("-", "--", "-.", ":")), strict=False))
+    for (upper, lower), (site, of) in zip(axes.T, f1.items(), strict=True):
+        for number, (method, colour, marker, line) in enumerate(styles):
+            style = dict(color=colour, marker=marker, markersize=5)
+            values = [of[method][name] for name in (clean, *noisy)]
+            upper.plot(noises, values, linestyle=line, label=methods[method], **style)
+            aside = np.arange(len(others)) + 0.16 * (number - (len(styles) - 1) / 2)
+            lower.plot(aside, [of[method][name] for name in others], linestyle="none", **style)
+        upper.set(title=site, xlabel="noise at each node [cm]", xlim=(-0.25, max(noises) + 0.25), ylim=(0, 1.05))
+        lower.set(xlim=(-0.5, len(others) - 0.5))
+        words = [name.replace(" missing", "\nmissing") if name != clean else "clean" for name in others]
+        lower.set_xticks(range(len(others)), words)
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(styles), fontsize=9)
+    return figure
+
+
+def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
+    """F1 against the time for all trajectories of a map.
+
+    points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
+    """
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    ax = figure.subplots()
+    for number, (name, (seconds, clean, noisy)) in enumerate(points.items()):
+        ax.plot([seconds, seconds], [clean, noisy], "-", color=f"C{number}", alpha=0.4)
+        ax.plot(seconds, clean, "o", color=f"C{number}", label=f"{name}: {seconds:.3g} s")
+        ax.plot(seconds, noisy, "v", color=f"C{number}")
+    for marker, label in (("o", "clean map"), ("v", "at the largest noise, simulators after the best filter")):
+        ax.plot([], [], marker, color="0.4", label=label)
+    ax.set_xscale("log")
+    ax.set(
+        xlabel="s for all trajectories of a map",
+        ylabel=f"F1 at {THRESHOLD:g}, events pooled",
+        ylim=(0, 1.05),
+    )
+    ax.grid(alpha=0.3)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    return figure

@@ -1,0 +1,178 @@
+"""How fast: terrain and labelling for several batch sizes, beside the sequential simulator, in one run.
+
+Medians of repeated calls on compiled code, compile time apart. `travjax bench` prints the table and writes it as TSV.
+"""
+
+import os
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from travjax.config import InputError
+from travjax.simulation import reference
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import failures, packed, simulate
+from travjax.terrain.styles import STYLES, generate_terrain
+
+COLUMNS = {
+    "what": "what",
+    "maps": "maps at once",
+    "ms_per_map": "ms a map",
+    "trajectories_per_s": "trajectories/s",
+    "speed_up": "x sequential",
+    "first_call_s": "first call s (compiles)",
+    "repeats": "repeats",
+    "peak_mib": "peak memory so far MiB",
+}
+
+BATCHES = (1, 8, 32, 128)
+STREAM_CHUNK = 320
+SEQUENTIAL = "sequential NumPy simulator"
+
+
+def machine() -> str:
+    """The device and versions that a figure belongs to, in one line."""
+    device = jax.devices()[0]
+    name = processor() if device.platform == "cpu" else device.device_kind
+    versions = f"jax {jax.__version__}, Python {platform.python_version()}"
+    return f"{device.platform} {name}, {os.cpu_count()} cores, {platform.machine()}, {versions}"
+
+
+def processor() -> str:
+    """The name of the processor, or its kind where the system does not tell."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        lines = []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return next(iter(named), "") or platform.processor() or platform.machine()
+
+
+def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+    """Raises InputError when the sequential simulator refuses robot, actions and grid; `node_table` does so earlier."""
+    try:
+        for trajectory in range(0, len(actions), len(actions.radii) ** 2):
+            reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)
+    except ValueError as error:
+        raise InputError(f"sequential simulator: {' '.join(str(error).split())}") from None
+
+
+def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
+    """Terrain and labelling on compiled code, a row for each batch size."""
+    for maps in BATCHES:
+        styles, seeds = _mixture(0, maps)
+        make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
+        yield _timed("terrain", maps, make, repeats, 0)
+    for maps in BATCHES:
+        yield labelling_row(maps, robot, actions, grid, repeats)
+
+
+def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
+    """Labelling of so many maps at once, on compiled code."""
+    heights = generate_terrain(*_mixture(0, maps), grid=grid)
+    heights = heights[0] if maps == 1 else heights
+    return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
+
+
+def reference_row(
+    robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
+) -> dict:
+    """One whole map by the sequential simulator, one trajectory after the other.
+
+    on_progress: is told how many trajectories of a call are done
+    """
+    heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        reference.simulate(heights, robot, actions, cell_size=grid.spacing, on_progress=on_progress)
+        seconds.append(time.perf_counter() - start)
+    return _row(SEQUENTIAL, 1, statistics.median(seconds), len(actions), None, repeats)
+
+
+def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
+    """Generates and labels that many maps, streamed in chunks, the labels kept in memory, one byte a trajectory."""
+    labels = np.empty((maps, len(actions)), np.uint8)
+    start = time.perf_counter()
+    for first in range(0, maps, STREAM_CHUNK):
+        count = min(STREAM_CHUNK, maps - first)
+        heights = generate_terrain(*_mixture(first, count), grid=grid)
+        margins = simulate(heights, robot, actions, grid=grid)
+        labels[first : first + count] = packed(failures(margins, robot), margins.known)
+        on_progress(count)
+    return _row("terrain and labelling, streamed", maps, time.perf_counter() - start, len(actions), None, 1)
+
+
+def start_row() -> dict:
+    """A new process from its start to its end, one map labelled, the compilation cache filled by an earlier process."""
+    seconds = []
+    for _ in range(4):
+        with tempfile.TemporaryDirectory() as folder:
+            start = time.perf_counter()
+            command = [sys.executable, "-m", "travjax", "label", "--count", "1", "--no-figures", "--out", folder]
+            done = subprocess.run(command, capture_output=True, text=True)
+            if done.returncode:
+                raise InputError(f"{' '.join(command)}: {done.stderr.strip().splitlines()[-1:]}")
+            seconds.append(time.perf_counter() - start)
+    return _row("command line, one map", 1, statistics.median(seconds[1:]), 0, None, 3, resource.RUSAGE_CHILDREN)
+
+
+def with_speed_up(rows: list[dict]) -> list[dict]:
+    """The rows with how many times faster than the sequential simulator each labels a map."""
+    sequential = next(row["ms_per_map"] for row in rows if row["what"] == SEQUENTIAL)
+    simulates = lambda row: row["trajectories_per_s"] is not None
+    return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
+
+
+def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
+    """One line for each row, the keys in `columns` and `machine` as header: this one, unless a row names its own."""
+    here = machine()
+    cells = [
+        [*("" if row[key] is None else str(row[key]) for key in columns), row.get("machine", here)] for row in rows
+    ]
+    path.write_text("\n".join("\t".join(line) for line in [[*columns, "machine"], *cells]) + "\n")
+
+
+def _mixture(first: int, count: int) -> tuple[list[str], range]:
+    return [STYLES[number % len(STYLES)] for number in range(first, first + count)], range(first, first + count)
+
+
+def _timed(what: str, maps: int, run: Callable[[], object], repeats: int, trajectories: int) -> dict:
+    seconds = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(run())
+        seconds.append(time.perf_counter() - start)
+    return _row(what, maps, statistics.median(seconds[1:]), trajectories, seconds[0], repeats)
+
+
+def _row(
+    what: str,
+    maps: int,
+    seconds: float,
+    trajectories: int,
+    first: float | None,
+    repeats: int,
+    whose: int = resource.RUSAGE_SELF,
+) -> dict:
+    return {
+        "what": what,
+        "maps": maps,
+        "ms_per_map": seconds / maps * 1e3,
+        "trajectories_per_s": maps * trajectories / seconds if trajectories else None,
+        "speed_up": None,
+        "first_call_s": first,
+        "repeats": repeats,
+        "peak_mib": resource.getrusage(whose).ru_maxrss / 1024,
+    }

@@ -1,0 +1,190 @@
+"""Printed tables."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from tabulate import tabulate
+
+from travjax.config import QUOTED, one_line
+from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
+from travjax.simulation.traverse import EVENTS
+
+PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure": 0.096}
+"""Shares of the paper's synthetic test trajectories that fail (SPEC section 10); its robot is not published in full."""
+
+
+AT_ONCE = 1024
+"""Maps whose flags are looked at together: they may lie on the disk."""
+
+
+TOLERANCE = 0.1
+"""By which the mean probability may differ from the frequency of failures and still be called right."""
+
+
+def shares_table(
+    groups: Sequence[str] | np.ndarray, failed: np.ndarray, known: np.ndarray, as_in_paper: bool = True
+) -> str:
+    """Shares of known trajectories that fail, for each group of maps and overall, the paper's below if they compare.
+
+    groups: [n] name of each map's group; failed: [n, t, 3]; known: [n, t]
+    """
+    members: np.ndarray = np.asarray(groups)
+    names = list(dict.fromkeys(groups))
+    parts = [slice(start, start + AT_ONCE) for start in range(0, len(known), AT_ONCE)]
+    counts = np.concatenate([_failures(failed[part], known[part]) for part in parts])
+    rows = [_shares(name, counts[members == name], known.shape[1]) for name in names]
+    if len(names) > 1:
+        rows.append(_shares("overall", counts, known.shape[1]))
+    if as_in_paper:
+        rows.append(["paper's test set", None, *(f"{share:.2%}" for share in PAPER_SHARES.values()), None, None])
+    headers = ["", "maps", *PAPER_SHARES, "maps with none", "known"]
+    return _table(rows, headers)
+
+
+def _failures(failed: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Of each map the known trajectories, those of them that fail by each event, and by any: [n, 5]."""
+    fails = np.asarray(failed) & np.asarray(known)[..., None]
+    return np.column_stack([known.sum(axis=1), fails.sum(axis=1), fails.any(axis=-1).sum(axis=1)])
+
+
+def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
+    """The row of some maps, from what `_failures` says of them: [n, 5]."""
+    known, *fails = counts.sum(axis=0)
+    if not known:
+        return [name, len(counts), *["-"] * 5, "0.0%"]
+    none = counts[counts[:, 0] > 0, -1] == 0
+    return [
+        name,
+        str(len(counts)),
+        *(f"{share / known:.2%}" for share in fails),
+        f"{none.mean():.1%}",
+        f"{known / (len(counts) * trajectories):.1%}",
+    ]
+
+
+def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:
+    """A table of dicts; columns maps keys to headings. None is left blank, numbers have four significant digits."""
+    cells = [[_cell(row[key]) for key in columns] for row in rows]
+    return _table(cells, list(columns.values()))
+
+
+def _cell(value) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float) and value < 1e4:
+        return f"{value:,.4g}"
+    return f"{value:,.0f}" if isinstance(value, int | float) else str(value)
+
+
+def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
+    """Figures and counts of each event and overall, the paper's below each; a dash is explained below the table."""
+    rows, notes = [], []
+    for name, scores in evaluation.scores.items():
+        precision, error = scores.average_precision, evaluation.calibration[name].error
+        rows.append([name, *_figures(scores.confusion), _share(precision), _share(error), *_counts(scores.confusion)])
+        notes.append(_why_undefined(name, scores.confusion))
+        if paper:
+            rows.append(["  paper", *_figures(paper[name]), "", "", *_counts(paper[name])])
+            notes.append(_why_undefined(f"{name} in the paper", paper[name]))
+    headers = ["", "accuracy", "recall", "precision", "F1", "failures", "AP", "ECE", "TN", "FP", "FN", "TP"]
+    return with_notes(_table(rows, headers), notes)
+
+
+def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
+    """The highest threshold that reaches each recall, what it costs, and the paper's precision at its own recall."""
+    rows, notes = [], []
+    for name, points in evaluation.points.items():
+        for point in points:
+            found = point.confusion
+            threshold, flagged = f"{point.threshold:.4g}", f"{(found.fp + found.tp) / found.samples:.2%}"
+            figures = [threshold, _share(found.recall), _share(found.precision), _share(found.f1), flagged]
+            beside = _share(paper[name].precision) if paper and _is_of(paper[name], point) else ""
+            rows.append([name, f"{point.wanted:.3f}", *(["-"] * 5 if math.isnan(point.threshold) else figures), beside])
+        notes.append(_why_undefined(name, points[0].confusion))
+    headers = ["", "wanted recall", "threshold", "recall", "precision", "F1", "predicted to fail", "paper's precision"]
+    return with_notes(_table(rows, headers), notes)
+
+
+def calibration_line(evaluation: Evaluation) -> str:
+    """One line: mean probability and measured frequency of failures, and whether probabilities are too high or low."""
+    over = lambda bins, values: float(np.nansum(bins.count * values) / bins.count.sum())
+    pairs = {
+        name: (over(bins, bins.probability), over(bins, bins.observed)) for name, bins in evaluation.calibration.items()
+    }
+    means = [f"{name} {mean:.4f} ({frequency:.4f})" for name, (mean, frequency) in pairs.items()]
+    mean, frequency = pairs[OVERALL]
+    ratio = mean / frequency if frequency else math.inf
+    verdict = "too high" if ratio > 1 + TOLERANCE else "too low" if ratio < 1 - TOLERANCE else "right"
+    times = f"{ratio:.2f} times the frequency" if frequency else "no sample fails"
+    return (
+        f"Calibration, mean probability and in brackets the measured frequency of failures: {', '.join(means)}. "
+        f"Overall the probabilities are {verdict} on average, {times}; reliability.png shows them by bin."
+    )
+
+
+def groups_table(evaluation: Evaluation) -> str:
+    """For each group its samples and, of each event, the share that fails, F1 and average precision."""
+    rows = []
+    undefined: dict[str, list[str]] = {event: [] for event in EVENTS}
+    for group, scores in [*evaluation.groups.items(), ("all", evaluation.scores)]:
+        group = one_line(group, QUOTED)
+        events = [scores[event] for event in EVENTS]
+        failures = [f"{one.confusion.failures:.2%}" for one in events]
+        f1 = [_share(one.confusion.f1) for one in (*events, scores["overall"])]
+        precisions = [_share(one.average_precision) for one in (*events, scores["overall"])]
+        for event, one in zip(EVENTS, events, strict=True):
+            undefined[event] += [] if one.confusion.failures else [group]
+        rows.append([group, f"{events[0].confusion.samples:,}", *failures, *f1, *precisions])
+    per_event = [
+        *(f"{event} fails" for event in EVENTS),
+        *(f"{what} {name}" for what in ("F1", "AP") for name in NAMES),
+    ]
+    headers = [title.replace(" ", "\n") for title in ("", "samples", *per_event)]
+    notes = [f"{event}: no sample fails in {', '.join(names)}" for event, names in undefined.items() if names]
+    return with_notes(_table(rows, headers), notes)
+
+
+def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
+    """Average precision of named predictors by event, overall and their mean, from `Evaluation.average_precision`."""
+    columns = (*NAMES, "mean")
+    undefined = [name for name in columns if any(math.isnan(values[name]) for values in rows.values())]
+    cells = [[predictor, *(_share(values[name]) for name in columns)] for predictor, values in rows.items()]
+    notes = [f"{name}: no sample fails, so average precision is undefined" for name in undefined]
+    return with_notes(_table(cells, ["average precision", *columns]), notes)
+
+
+def _figures(counts: Confusion) -> list[str]:
+    figures = (counts.accuracy, counts.recall, counts.precision, counts.f1)
+    return [*(_share(figure) for figure in figures), f"{counts.failures:.2%}"]
+
+
+def _counts(counts: Confusion) -> list[str]:
+    return [f"{count:,}" for count in (counts.tn, counts.fp, counts.fn, counts.tp)]
+
+
+def _share(value: float) -> str:
+    return "-" if math.isnan(value) else f"{value:.3f}"
+
+
+def _is_of(paper: Confusion, point: OperatingPoint) -> bool:
+    return abs(paper.recall - point.wanted) < 0.0005
+
+
+def _why_undefined(what: str, counts: Confusion) -> str:
+    """Why some figures of a confusion are a dash; nothing where none is."""
+    if not counts.fn + counts.tp:
+        return f"{what}: no sample fails, so the figures with a dash are undefined"
+    if not counts.fp + counts.tp:
+        return f"{what}: no sample is predicted to fail, so precision is undefined"
+    return ""
+
+
+def _table(rows: list[list[str]], headers: Sequence[str]) -> str:
+    shown = [[one_line(cell, QUOTED) if isinstance(cell, str) else cell for cell in row] for row in rows]
+    return tabulate(shown, headers, disable_numparse=True, stralign="right", colalign=("left",))
+
+
+def with_notes(table: str, notes: Iterable[str]) -> str:
+    """The table and below it what its dashes mean."""
+    return "\n".join([table, *(f"- {note}" for note in notes if note)])

@@ -1,0 +1,259 @@
+"""What came of the transfer experiment: scores of every arm, seed, epoch and held-out site, in tables and JSON.
+
+Everything is made from the confusions that training wrote to metrics.jsonl, at a threshold of 0.5. Figures of several
+seeds are their mean and, after the sign, their standard deviation.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from travjax.config import require
+from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, to_json
+from travjax.evaluation.tables import rows_table, with_notes
+
+ALL = "all held-out"
+"""The held-out sites together: their confusions are added."""
+
+PAPER_BEST = {
+    "random": None,
+    "ImageNet": {"recall": 0.54, "precision": 0.14, "f1": 0.21},
+    "ImageNet + synthetic": {"recall": 0.76, "precision": 0.31, "f1": 0.46},
+}
+"""The paper's best epoch of each arm on its own site, where 0.2 % of the trajectories fail (SPEC section 10)."""
+
+COUNTS = ("tn", "fp", "fn", "tp")
+
+Confusions = dict[str, dict[str, Confusion]]
+"""By site, ALL among them, and by event, "overall" among them."""
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """One row of a run: number 0 is the first state, before any training.
+
+    validation: average precision of the events pooled on the validation windows; None for the first state
+    held_out:   confusions on each held-out site and on ALL
+    """
+
+    number: int
+    validation: float | None
+    held_out: Confusions
+
+    @staticmethod
+    def of(row: Mapping) -> "Epoch":
+        """From a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
+        allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
+        require(_is_scored(row), "row of metrics.jsonl", row, allowed)
+        sites = {
+            site: {name: Confusion(*(scores[name]["confusion"][count] for count in COUNTS)) for name in NAMES}
+            for site, scores in row["watched"].items()
+        }
+        if len(sites) > 1:
+            sites[ALL] = {name: sum((one[name] for one in sites.values()), Confusion(0, 0, 0, 0)) for name in NAMES}
+        precision = row.get("average_precision")
+        return Epoch(row["epoch"], precision and precision[OVERALL], sites)
+
+
+def _is_scored(row: Mapping) -> bool:
+    """Whether a row of metrics.jsonl holds counts of every event on each site, and a number from validation if any."""
+    at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
+    sites, precision = row.get("watched"), row.get("average_precision")
+    if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
+        return False
+    counts = [
+        at(at(at(site, name), "confusion"), count) for site in sites.values() for name in NAMES for count in COUNTS
+    ]
+    overall = at(precision, OVERALL) if isinstance(precision, Mapping) and OVERALL in precision else "none"
+    validated = precision is None or type(overall) in (int, float, type(None))
+    return validated and all(type(count) is int and count >= 0 for count in counts)
+
+
+@dataclass(frozen=True)
+class Run:
+    """The epochs of one arm and seed, the first state first."""
+
+    epochs: tuple[Epoch, ...]
+
+    def best(self, site: str) -> Epoch:
+        """The epoch of the largest F1, events pooled, on a held-out site: the paper's way, which looks at the test."""
+        return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.held_out[site][OVERALL].f1))
+
+    @property
+    def chosen(self) -> Epoch:
+        """The epoch that is best on the validation windows, by average precision; its checkpoint is the run's best."""
+        return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.validation))
+
+
+def always_fails(counts: Confusion) -> Confusion:
+    """Of the predictor that says "fails" of every trajectory, on the samples of these counts."""
+    return Confusion(0, counts.tn + counts.fp, 0, counts.fn + counts.tp)
+
+
+def _or_zero(value: float | None) -> float:
+    return 0.0 if value is None or math.isnan(value) else value
+
+
+@dataclass(frozen=True)
+class Results:
+    """All runs: by arm, and of each arm by seed."""
+
+    arms: dict[str, dict[int, Run]]
+
+    @staticmethod
+    def of(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
+        """From the rows of every arm and seed."""
+        run = lambda part: Run(tuple(Epoch.of(row) for row in part))
+        return Results({arm: {seed: run(part) for seed, part in seeds.items()} for arm, seeds in rows.items()})
+
+    @cached_property
+    def _some(self) -> Confusions:
+        """Of any run: how many samples fail is the same in all."""
+        return next(iter(next(iter(self.arms.values())).values())).epochs[0].held_out
+
+    @property
+    def sites(self) -> list[str]:
+        """The held-out sites, and ALL if they are several."""
+        return list(self._some)
+
+    def always(self, site: str, event: str = OVERALL) -> Confusion:
+        """The predictor that says "fails" of every trajectory."""
+        return always_fails(self._some[site][event])
+
+    def f1(self, arm: str, site: str) -> np.ndarray:
+        """F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
+        runs = self.arms[arm].values()
+        return np.array([[epoch.held_out[site][OVERALL].f1 for epoch in run.epochs] for run in runs])
+
+    def best(self, arm: str, site: str) -> list[Epoch]:
+        """The best epoch of each seed on a held-out site."""
+        return [run.best(site) for run in self.arms[arm].values()]
+
+    def chosen(self, arm: str) -> list[Epoch]:
+        """The epoch of each seed that is best on the validation windows."""
+        return [run.chosen for run in self.arms[arm].values()]
+
+    def first(self, arm: str) -> list[Epoch]:
+        """The first state of each seed."""
+        return [run.epochs[0] for run in self.arms[arm].values()]
+
+
+ARM_COLUMNS = {
+    "site": "held-out site",
+    "arm": "first weights",
+    "epoch": "best\nepoch",
+    "f1": "F1",
+    "recall": "recall",
+    "precision": "precision",
+    "way": "of the way\nto 1",
+    "chosen": "validation's\nepoch",
+    "chosen_f1": "its F1",
+    "chosen_recall": "its recall",
+    "chosen_precision": "its precision",
+}
+
+
+def arms_table(results: Results) -> str:
+    """For each held-out site: the predictor that always says "fails", each arm at its two epochs, and the paper's."""
+    rows: list[dict] = []
+    for site in results.sites:
+        always = results.always(site)
+        rows.append(dict.fromkeys(ARM_COLUMNS) | {"site": site, "arm": "always fails", **_figures([always])})
+        for arm in results.arms:
+            best, chosen = results.best(arm, site), results.chosen(arm)
+            at_best, at_chosen = ([epoch.held_out[site][OVERALL] for epoch in epochs] for epochs in (best, chosen))
+            way = [(one.f1 - always.f1) / (1 - always.f1) for one in at_best]
+            rows.append(
+                {"site": "", "arm": arm, "epoch": _numbers(best), **_figures(at_best), "way": mean_and_spread(way)}
+                | {"chosen": _numbers(chosen)}
+                | {f"chosen_{name}": value for name, value in _figures(at_chosen).items()}
+            )
+    for arm, figures in PAPER_BEST.items():
+        shown = {name: f"{value:.2f}" for name, value in figures.items()} if figures else {"f1": "near 0"}
+        site = "paper: its own" if arm == next(iter(PAPER_BEST)) else ""
+        rows.append(dict.fromkeys(ARM_COLUMNS) | {"site": site, "arm": arm} | shown)
+    return with_notes(rows_table(rows, ARM_COLUMNS), _undefined(results, rows))
+
+
+EVENT_COLUMNS = {
+    "site": "held-out site",
+    "event": "event",
+    "failures": "fails",
+    "state": "model",
+    "accuracy": "accuracy",
+    "recall": "recall",
+    "precision": "precision",
+    "f1": "F1",
+    "always": "F1 of\nalways fails",
+}
+
+
+def events_table(results: Results, arm: str) -> str:
+    """For each held-out site and event an arm untrained, at its best epoch and at validation's; the paper's below."""
+    rows = []
+    for site in results.sites:
+        states = {"untrained": results.first(arm), "best epoch": results.best(arm, site)}
+        states["validation's epoch"] = results.chosen(arm)
+        for event in NAMES:
+            always = results.always(site, event)
+            for state, epochs in states.items():
+                counts = [epoch.held_out[site][event] for epoch in epochs]
+                first = state == "untrained"
+                place = {
+                    "site": site if first and event == NAMES[0] else "",
+                    "event": event if first else "",
+                    "failures": f"{always.failures:.2%}" if first else "",
+                    "always": mean_and_spread([always.f1]) if first else "",
+                }
+                rows.append(place | {"state": state} | _figures(counts, ("accuracy", "recall", "precision", "f1")))
+    notes = _undefined(results, rows)
+    for event, paper in PAPER_REAL.items():
+        place = {"site": "paper: its own" if event == NAMES[0] else "", "event": event, "state": "paper, transferred"}
+        place |= {"failures": f"{paper.failures:.2%}", "always": mean_and_spread([always_fails(paper).f1])}
+        rows.append(place | _figures([paper], ("accuracy", "recall", "precision", "f1")))
+    notes = [*notes, "tilt in the paper: no sample fails, so its figures are undefined"]
+    return with_notes(rows_table(rows, EVENT_COLUMNS), notes)
+
+
+def _figures(counts: Iterable[Confusion], names: Sequence[str] = ("f1", "recall", "precision")) -> dict[str, str]:
+    counts = list(counts)
+    return {name: mean_and_spread([getattr(one, name) for one in counts]) for name in names}
+
+
+def _numbers(epochs: Iterable[Epoch]) -> str:
+    return ", ".join(str(epoch.number) for epoch in epochs)
+
+
+def mean_and_spread(values: Sequence[float]) -> str:
+    """Mean and standard deviation of the seeds; a dash where a value is undefined."""
+    if any(math.isnan(value) for value in values):
+        return "-"
+    spread = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 and np.ptp(values) > 0 else ""
+    return f"{np.mean(values):.3f}{spread}"
+
+
+def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
+    """Why figures of some events and sites in the rows of a table are a dash."""
+    none = [
+        f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
+        for site in results.sites
+        for event in NAMES
+        if not results.always(site, event).tp
+    ]
+    dashes = any(row.get(name) == "-" for row in rows for name in ("precision", "chosen_precision"))
+    return none + ["a dash under precision: in some seed nothing is predicted to fail"] * dashes
+
+
+def results_json(results: Results) -> dict:
+    """Everything, for results.json."""
+
+    def run(one: Run) -> dict:
+        best = {site: one.best(site).number for site in results.sites}
+        return {"best_epoch": best, "validation_epoch": one.chosen.number, "epochs": to_json(one.epochs)}
+
+    arms = {arm: {str(seed): run(one) for seed, one in seeds.items()} for arm, seeds in results.arms.items()}
+    always = {site: {event: results.always(site, event) for event in NAMES} for site in results.sites}
+    return {"arms": arms, "always_fails": to_json(always)}

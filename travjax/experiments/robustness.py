@@ -1,0 +1,185 @@
+"""Simulators and estimators on the same maps, clean and as sensors see them; labels are always those of the clean map.
+
+A method turns maps [n, rows, cols] into scores of failure [n, t, 3], of which 0.5 and more says "fails".
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from travjax.data import sensor_noise, sites
+from travjax.data.dataset import DatasetConfig
+from travjax.data.map_batches import Batch, joined, labelled, synthetic_batches
+from travjax.data.provenance import SitesConfig
+from travjax.data.sampling import Samples
+from travjax.devices import Devices
+from travjax.evaluation.metrics import NAMES, OVERALL, Confusion, average_precision, confusions
+from travjax.models.trajectory_resnet import take_apart
+from travjax.runs.inference import logits_of, probabilities
+from travjax.runs.predictor import Predictor
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import EVENTS, simulate
+
+Maps = Float[np.ndarray, "n rows cols"]
+Fails = Float[np.ndarray, "*k 3"]
+Progress = Callable[[int], object]
+
+NOISES = (0.01, 0.02, 0.05)
+"""Standard deviations of the noise in metres."""
+
+MISSING = (0.05, 0.2)
+"""Shares of nodes that are missing."""
+
+CLEAN, COARSE = "none", "0.125 m"
+
+GAUSSIANS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+"""Standard deviations in nodes that the simulator's map may be smoothed by."""
+
+
+Corruption = Callable[[Maps, np.random.Generator], Maps]
+
+
+def _noise(deviation: float) -> Corruption:
+    return lambda maps, rng: sensor_noise.noisy(maps, deviation, rng)
+
+
+def _missing(share: float) -> Corruption:
+    return lambda maps, rng: sensor_noise.filled(sensor_noise.thinned(maps, share, rng))
+
+
+CORRUPTIONS: dict[str, Corruption] = {
+    CLEAN: lambda maps, rng: maps,
+    **{f"noise {100 * noise:g} cm": _noise(noise) for noise in NOISES},
+    **{f"{share:.0%} missing": _missing(share) for share in MISSING},
+    COARSE: lambda maps, rng: sensor_noise.upsampled(maps),
+}
+"""What is done to maps, by name: each of them is seen as a sensor may see it, with all nodes known."""
+
+FILTERS: dict[str, Callable[[Maps], Maps]] = {
+    "no filter": lambda maps: maps,
+    "median 3 x 3": sensor_noise.median,
+    **{f"Gaussian {nodes:g}": partial(sensor_noise.smoothed, deviation=nodes) for nodes in GAUSSIANS},
+}
+"""What may be done to a corrupted map before it is simulated; deviations in nodes."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Clean maps and what the simulator says of them.
+
+    heights: [n, rows, cols] metres, none unknown: what was unknown has the height of the nearest known node
+    known:   [n, t] whether a trajectory touches known ground alone; the others count in no score
+    failed:  [n, t, 3]
+    margins: [n, t, 3] metres, metres, radians, NaN where unknown
+    """
+
+    heights: Maps
+    known: Bool[np.ndarray, "n t"]
+    failed: Bool[np.ndarray, "n t 3"]
+    margins: Float[np.ndarray, "n t 3"]
+    robot: Robot
+    actions: ActionSpace
+    grid: Grid
+
+    @staticmethod
+    def synthetic(
+        count: int,
+        seed: int,
+        robot: Robot,
+        actions: ActionSpace,
+        grid: Grid,
+        on_progress: Progress = lambda count: None,
+    ) -> "Ground":
+        """Maps of all styles, drawn as a data set of that size and seed draws them; on_progress: is told of maps."""
+        config, batches = DatasetConfig(count, seed), []
+        for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), grid):
+            batches.append(labelled(batch, robot, actions, grid))
+            on_progress(len(batch["heights"]))
+        return Ground._of(joined(batches), robot, actions, grid)
+
+    @staticmethod
+    def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
+        """Windows of real maps; heights: NaN unknown."""
+        return Ground._of(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
+
+    @staticmethod
+    def _of(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
+        margins = np.stack([maps[event] for event in EVENTS], axis=-1)
+        heights = sensor_noise.filled(maps["heights"])
+        return Ground(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
+
+    def seen(self, name: str, seed: int) -> Maps:
+        """The maps with a corruption of CORRUPTIONS, the same each time."""
+        rng = np.random.default_rng((seed, list(CORRUPTIONS).index(name)))
+        return np.asarray(CORRUPTIONS[name](self.heights, rng), np.float32)
+
+    def simulated(self, maps: Maps) -> Fails:
+        """What the simulator says of maps: 1 fails, 0 does not."""
+        margins = simulate(maps, self.robot, self.actions, grid=self.grid).events()
+        return (np.asarray(margins) > np.asarray(self.robot.limits, np.float32)).astype(np.float32)
+
+    def best_filter(self, maps: Maps, on_progress: Progress = lambda count: None) -> str:
+        """The one of FILTERS after which the simulator has the largest F1 on these maps, corrupted as they are."""
+        scores = {}
+        for name, smooth in FILTERS.items():
+            scores[name] = self.scores(self.simulated(smooth(maps)))[OVERALL].f1
+            on_progress(1)
+        return max(scores, key=lambda name: scores[name])
+
+    def scores(self, fails: Fails, threshold: float = 0.5) -> dict[str, Confusion]:
+        """The confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, 3]."""
+        return scores(fails[self.known], self.failed[self.known], threshold)
+
+
+def of_sites(
+    config: SitesConfig,
+    most: int,
+    seed: int,
+    robot: Robot,
+    actions: ActionSpace,
+    grid: Grid,
+    on_progress: Progress = lambda count: None,
+) -> dict[str, Ground]:
+    """The windows of each site by its name: all that are known well enough, or `most` drawn at random.
+
+    config: its splits and turns are left aside; on_progress: is told of windows that were read
+    Raises InputError when a file is missing, cannot be read or leaves no window.
+    """
+    whole = (replace(site, split="test", test_strip=(), validation_strip=()) for site in config.site)
+    data = sites.read(replace(config, site=tuple(whole), rotations=False), robot, actions, grid, on_progress)
+    grounds = {}
+    for number, site in enumerate(config.site):
+        own, rng = np.flatnonzero(data.group == site.group), np.random.default_rng((seed, number))
+        chosen = np.sort(rng.choice(own, min(most, len(own)), replace=False))
+        grounds[site.group] = Ground.real(data.heights[chosen], robot, actions, grid)
+    return grounds
+
+
+def by_margins(margins: Float[np.ndarray, "n t 3"], robot: Robot) -> Fails:
+    """Scores of regressed margins, which are 0.5 at the robot's limits."""
+    return np.clip(margins / np.asarray(robot.limits, np.float32) / 2, 0, 1)
+
+
+def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
+    """Probabilities of an estimator for samples [k] of maps: [k, 3]; on_progress: is told of samples."""
+    devices = Devices.all()
+    graph, variables = take_apart(predictor.network)
+    variables, source = devices.replicate(variables), devices.replicate(predictor.run.source(maps))
+    return probabilities(logits_of(graph, variables, source, samples, devices, 64 * devices.mesh.size, on_progress))
+
+
+def scores(fails: Fails, failed: Bool[np.ndarray, "*k 3"], threshold: float = 0.5) -> dict[str, Confusion]:
+    """The confusion of each event, and of all pooled."""
+    return confusions(fails.reshape(-1, len(EVENTS)), failed.reshape(-1, len(EVENTS)), threshold)
+
+
+def average_precisions(fails: Fails, failed: Bool[np.ndarray, "*k 3"]) -> dict[str, float]:
+    """Of each event, and of all pooled."""
+    columns = [(fails[..., event], failed[..., event]) for event in range(len(EVENTS))]
+    pairs = zip(NAMES, [*columns, (fails, failed)], strict=True)
+    return {name: average_precision(one.ravel(), true.ravel()) for name, (one, true) in pairs}

@@ -1,0 +1,211 @@
+"""Scores of the comparison: the names of the methods, what each reaches on a ground, and the tables of it."""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from travjax import progress
+from travjax.data.sampling import Samples
+from travjax.evaluation import metrics
+from travjax.evaluation.metrics import NAMES, OVERALL, Confusion
+from travjax.evaluation.tables import rows_table
+from travjax.experiments.robustness import (
+    CLEAN,
+    CORRUPTIONS,
+    FILTERS,
+    Ground,
+    Progress,
+    average_precisions,
+    by_margins,
+    of_samples,
+    scores,
+)
+from travjax.runs.predictor import Predicted, Predictor
+from travjax.simulation.traverse import EVENTS
+from travjax.training.step import LARGE_MARGIN
+
+SIMULATOR, FILTERED = "simulator", "simulator, best filter"
+HAZARD, MARGINS, NETWORK = "hazard field", "hazard field, margins", "ResNet50"
+METHODS = (SIMULATOR, FILTERED, HAZARD, MARGINS, NETWORK)
+
+ON_SITES = (*FILTERS, HAZARD, MARGINS)
+"""Methods on real ground: the simulator after each filter, and the hazard field."""
+
+IN_FIGURE = {
+    "no filter": SIMULATOR,
+    "median 3 x 3": "simulator after a median of 3 x 3",
+    "Gaussian 1.25": "simulator after a Gaussian of 1.25 nodes",
+    HAZARD: HAZARD,
+}
+"""Methods of ON_SITES that the figure of real ground shows, and their names in it."""
+
+RECALL = 0.97
+"""For which a threshold is chosen on validation maps."""
+
+SiteScores = dict[str, dict[str, dict[str, Confusion]]]
+"""Of one site: by corruption, method and event."""
+
+
+def best_filters(validation: Ground, seed: int) -> dict[str, str]:
+    """For every corruption the filter of FILTERS after which the simulator is best on the validation maps."""
+    with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
+        return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
+
+
+def compare(
+    test: Ground,
+    validation: Ground,
+    field: Predictor,
+    resnet: Predictor | None,
+    samples: int,
+    chosen: Mapping[str, str],
+    seed: int,
+) -> dict:
+    """For every corruption: the filter chosen for it, and for every method its confusions and average precisions."""
+    results: dict[str, dict] = {}
+    drawn = _drawn(test, samples, seed)
+    methods = 3 + (resnet is not None)
+    with progress.bar("corruptions", len(CORRUPTIONS) * methods, "method") as bar:
+        for name in CORRUPTIONS:
+            seen = test.seen(name, seed)
+            predicted = field.predict(seen)
+            found = {
+                SIMULATOR: (test.simulated(seen), test.failed),
+                FILTERED: (test.simulated(FILTERS[chosen[name]](seen)), test.failed),
+                HAZARD: (predicted.probability, test.failed),
+                MARGINS: (by_margins(_margins(predicted.margins), test.robot), test.failed),
+            }
+            bar.update(3)
+            if resnet:
+                found[NETWORK] = (of_samples(resnet, seen, drawn), test.failed[drawn])
+                bar.update()
+            by_method = {method: _scored(*pair) for method, pair in found.items()}
+            results[name] = {"filter": chosen[name], "methods": by_method}
+            if name == CLEAN:
+                results[name] |= _on_clean_maps(test, validation, field, predicted)
+    return results
+
+
+def _margins(margins: np.ndarray | None) -> np.ndarray:
+    assert margins is not None  # the hazard field has them
+    return margins
+
+
+def _drawn(test: Ground, samples: int, seed: int) -> Samples:
+    """Random trajectories of all maps, for what is too slow for all of them."""
+    rng = np.random.default_rng(seed)
+    maps, trajectories = test.failed.shape[:2]
+    places = np.sort(rng.choice(maps * trajectories, min(samples, maps * trajectories), replace=False))
+    return places // trajectories, places % trajectories
+
+
+def _scored(fails: np.ndarray, failed: np.ndarray) -> dict:
+    return {"confusion": scores(fails, failed), "average_precision": average_precisions(fails, failed)}
+
+
+def _on_clean_maps(test: Ground, validation: Ground, field: Predictor, predicted: Predicted) -> dict:
+    """The threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
+    probability = field.predict(validation.heights).probability
+    threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
+    largest = LARGE_MARGIN * np.asarray(test.robot.limits)
+    off = np.minimum(_margins(predicted.margins), largest) - np.minimum(test.margins, largest)
+    return {
+        "threshold": threshold,
+        "at_threshold": scores(predicted.probability, test.failed, threshold),
+        "margin_errors": dict(zip(EVENTS, np.abs(off).mean(axis=(0, 1)).tolist(), strict=True)),
+    }
+
+
+def on_sites(real: Mapping[str, Ground], field: Predictor, seed: int) -> dict[str, SiteScores]:
+    """For every site and corruption: the confusions of the simulator after each filter, and of the hazard field."""
+    with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
+        return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
+
+
+def _of_site(ground: Ground, field: Predictor, seed: int, on_progress: Progress) -> SiteScores:
+    found: SiteScores = {}
+    for name in CORRUPTIONS:
+        seen, by_method = ground.seen(name, seed), {}
+        for smooth, of in FILTERS.items():
+            by_method[smooth] = ground.scores(ground.simulated(of(seen)))
+            on_progress(1)
+        predicted = field.predict(seen)
+        by_method[HAZARD] = ground.scores(predicted.probability)
+        by_method[MARGINS] = ground.scores(by_margins(_margins(predicted.margins), ground.robot))
+        on_progress(2)
+        found[name] = by_method
+    return found
+
+
+def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
+    """F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
+    return {
+        method: {name: one["methods"][method]["confusion"][OVERALL].f1 for name, one in results.items()}
+        for method in METHODS
+        if method in results[CLEAN]["methods"]
+    }
+
+
+def f1_of_site(site: SiteScores, chosen: Mapping[str, str]) -> dict[str, dict[str, float]]:
+    """F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: of each corruption the filter."""
+    f1 = {method: {name: of[method][OVERALL].f1 for name, of in site.items()} for method in ON_SITES}
+    return f1 | {FILTERED: {name: f1[smooth][name] for name, smooth in chosen.items()}}
+
+
+def shown(value: float) -> str:
+    """A share with three digits, or a dash where it is undefined."""
+    return "-" if math.isnan(value) else f"{value:.3f}"
+
+
+QUALITY = {"method": "clean maps", "event": "", "recall": "recall", "precision": "precision", "f1": "F1", "ap": "AP"}
+
+
+def quality_table(clean: dict) -> str:
+    """Recall, precision, F1 and average precision of each method and event on the clean maps."""
+    rows = []
+    for method, scored in clean["methods"].items():
+        if method == FILTERED:
+            continue
+        for event in NAMES:
+            confusion, precision = scored["confusion"][event], scored["average_precision"][event]
+            rows.append(_quality(method if event == NAMES[0] else "", event, confusion, precision))
+    for event in NAMES:
+        name = f"{HAZARD} at {clean['threshold']:.3f}" if event == NAMES[0] else ""
+        rows.append(_quality(name, event, clean["at_threshold"][event], math.nan))
+    return rows_table(rows, QUALITY)
+
+
+def _quality(method: str, event: str, confusion: Confusion, precision: float) -> dict:
+    figures = {"recall": confusion.recall, "precision": confusion.precision, "f1": confusion.f1, "ap": precision}
+    return {"method": method, "event": event} | {key: shown(value) for key, value in figures.items()}
+
+
+def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> str:
+    """F1 of every method on real ground: for each corruption a row a site; below it filters and who is ahead.
+
+    sites: scores by name; chosen: of each corruption the filter of FILTERED
+    """
+    plain, *filters = FILTERS
+    heads = {plain: SIMULATOR} | {name: name for name in (*filters, HAZARD, MARGINS)} | {FILTERED: "best filter"}
+    columns = {"corruption": "F1", "site": "", "fails": "fails"}
+    columns |= {method: head.replace(" ", "\n", 1) for method, head in heads.items()}
+    f1 = {site: f1_of_site(of, chosen) for site, of in sites.items()}
+    rows = []
+    for name in CORRUPTIONS:
+        for number, (site, of_site) in enumerate(sites.items()):
+            row = {"corruption": "" if number else name, "site": site}
+            row["fails"] = f"{of_site[name][HAZARD][OVERALL].failures:.2%}"
+            rows.append(row | {method: shown(of[name]) for method, of in f1[site].items()})
+    filters_chosen = "; ".join(f"{name}: {smooth}" for name, smooth in chosen.items())
+    return f"{rows_table(rows, columns)}\n\nBest filter: {filters_chosen}.\n{_where_better(f1)}"
+
+
+def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
+    """One line: on how many sites the field is above the simulator after the best filter; f1: by site and method."""
+    counts = []
+    for name in CORRUPTIONS:
+        measured = [of for of in f1.values() if not math.isnan(of[HAZARD][name])]
+        better = sum(of[HAZARD][name] > of[FILTERED][name] for of in measured)
+        counts.append(f"{name}: {better} of {len(measured)}")
+    return f"Sites on which the hazard field is above the simulator after the best filter: {'; '.join(counts)}."

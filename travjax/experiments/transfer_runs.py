@@ -1,0 +1,232 @@
+"""The transfer experiment: what pre-training is worth on real maps (SPEC section 11, the second half of the paper).
+
+Runs that differ in their first weights alone, the arms, train on the same samples of real maps with the same settings,
+and are scored after every epoch on held-out ground. With `head_epochs` the trunks stay frozen and each one's features
+are computed once for all seeds; with `epochs` everything is trained, as in the paper.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from flax import nnx
+
+from travjax.config import InputError, require
+from travjax.data.dataset import Dataset, require_same
+from travjax.data.sampling import Samples, natural_sample
+from travjax.devices import Devices
+from travjax.files import output_folder, save_npz
+from travjax.jax_flags import key_of
+from travjax.models.names import FIELD
+from travjax.models.trajectory_resnet import Estimator, Heads, create
+from travjax.resnet.imagenet_weights import load_weights
+from travjax.runs.checkpoint import load_meta
+from travjax.runs.preset import MOST, TrainingConfig, find_weights
+from travjax.runs.run import Network, Run, checked_meta, has_checkpoints, load_estimator
+from travjax.runs.run_log import read_rows
+from travjax.training.map_training import trainer_of
+from travjax.training.trainer import Trainer
+
+ARMS = ("random", "ImageNet", "ImageNet + synthetic")
+"""What the runs begin with, in the paper's order."""
+
+SCRATCH, IMAGENET, SYNTHETIC = ARMS
+
+FIELD_ARMS = (SCRATCH, "synthetic")
+"""Likewise of the hazard field, for which there are no ImageNet weights."""
+
+
+@dataclass(frozen=True)
+class TransferConfig:
+    """The experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
+
+    sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
+    synthetic:  preset that trains the synthetic model
+    seeds:      of the runs of each arm: order, dropout, first weights that are random
+    each:       random known trajectories of each held-out window that are scored, 0 for all
+    shown:      held-out site in the figure of maps; its licence must allow that
+    shown_maps: number of its windows there
+    training:   `head_epochs` for frozen trunks or `epochs` for all of it, not both
+
+    Files are named from the folder of the preset. Raises InputError that names field, value and what is allowed.
+    """
+
+    sites: str = "sites.toml"
+    synthetic: str = "../train/laptop.toml"
+    seeds: tuple[int, ...] = (0, 1, 2)
+    each: int = 200
+    shown: str = "mars_live_site"
+    shown_maps: int = 2
+    training: TrainingConfig = TrainingConfig()
+
+    def __post_init__(self):
+        for name in ("sites", "synthetic", "shown"):
+            require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
+        for name in ("each", "shown_maps"):
+            value = getattr(self, name)
+            require(type(value) is int and 0 <= value <= MOST, name, value, f"a whole number from 0 to {MOST}")
+        whole = isinstance(self.seeds, tuple) and bool(self.seeds)
+        whole = whole and all(type(seed) is int and 0 <= seed < 2**31 for seed in self.seeds)
+        allowed = "different whole numbers from 0, at least one"
+        require(whole and len(set(self.seeds)) == len(self.seeds), "seeds", self.seeds, allowed)
+        both = self.training.head_epochs and self.training.epochs
+        require(not both, "[training] head_epochs", self.training.head_epochs, "0 where epochs is not, or the reverse")
+
+    @property
+    def frozen(self) -> bool:
+        """Whether the trunks are."""
+        return self.training.head_epochs > 0
+
+    @property
+    def epochs(self) -> int:
+        """Of each run."""
+        return self.training.head_epochs or self.training.epochs
+
+
+class Transfer:
+    """The runs of all arms, in a folder.
+
+    base:      the synthetic model's run; synthetic: its folder, which is read when its arm begins
+    held_out:  samples of the test maps of each site, at natural frequency
+    Raises InputError when the data set is not for the run's robot, action space and grid, when it has no held-out site
+    or not the one to be shown, and when the ImageNet weights are missing.
+    """
+
+    def __init__(
+        self, config: TransferConfig, base: Run, synthetic: Path, dataset: Dataset, folder: Path, devices: Devices
+    ):
+        self.config, self.base, self.synthetic, self.dataset = config, base, synthetic, dataset
+        self.folder, self.devices = folder, devices
+        require_same(dataset, base.robot, base.actions, base.grid)
+        self.held_out = _held_out(dataset, config)
+        if config.shown_maps:
+            allowed = f"a held-out site, {', '.join(self.held_out)}, or shown_maps 0"
+            require(config.shown in self.held_out, "shown", config.shown, allowed)
+        find_weights(base.preset.weights)
+
+    @property
+    def arms(self) -> tuple[str, ...]:
+        """What the runs begin with; the synthetic model is the last."""
+        return FIELD_ARMS if self.base.preset.model == FIELD else ARMS
+
+    def run_of(self, arm: str, seed: int) -> Run:
+        """What a run is made from: the synthetic model's settings, trained as the experiment says."""
+        preset = self.base.preset
+        weights = {SCRATCH: "none", IMAGENET: preset.weights}.get(arm, f"{self.synthetic}")
+        training = replace(self.config.training, seed=seed, subset_seed=self.config.training.drawn_by)
+        return replace(self.base, preset=replace(preset, weights=weights, training=training))
+
+    def place_of(self, arm: str, seed: int) -> Path:
+        """The folder of a run, which is one of `travjax train`."""
+        return self.folder / "runs" / f"{_name(arm)}_{seed}"
+
+    def rows(self, arm: str, seed: int) -> list[dict]:
+        """A row for the first state and for each epoch of a run, which is trained as far as it is not yet."""
+        place, run = self.place_of(arm, seed), self.run_of(arm, seed)
+        if has_checkpoints(place):
+            self._require_same(place, run)
+        if not self._is_finished(place, run):
+            self._train(arm, seed, place)
+        path = place / "metrics.jsonl"
+        rows = [row for row in read_rows(path) if "watched" in row]
+        found, last, sites = [row.get("epoch") for row in rows], self.config.epochs, list(self.held_out)
+        scored = all(isinstance(row["watched"], dict) and list(row["watched"]) == sites for row in rows)
+        anew = f"0 to {last}, each with scores of {', '.join(sites)}; remove the folder to train it anew"
+        require(found == list(range(last + 1)) and scored, f"{path}: epochs", found, anew)
+        return rows
+
+    def estimator(self, arm: str, seed: int) -> Network:
+        """Of the epoch that is best on the validation windows."""
+        return load_estimator(self.place_of(arm, seed), "best")[1]
+
+    @cached_property
+    def pretrained(self) -> Network:
+        """The synthetic model, untouched."""
+        return load_estimator(self.synthetic, "best")[1]
+
+    def _require_same(self, place: Path, run: Run) -> None:
+        """A run that was begun goes on with what it began with, and so do its figures."""
+        begun = Run.load(place)
+        begun.require_same(run, f"{place}")
+        first = begun.preset.weights
+        require(first == run.preset.weights, f"{place}: weights", run.preset.weights, f"{first}, as in the run so far")
+
+    def _is_finished(self, place: Path, run: Run) -> bool:
+        try:
+            meta = load_meta(place / "checkpoints")
+        except InputError:
+            return False
+        checked_meta(meta, place, run)
+        begun, given = meta["dataset"], self.dataset.fingerprint
+        require(begun == given, f"{place}: data set", given, f"{begun}, the one that the run was trained on")
+        return meta["position"]["epoch"] == self.config.epochs
+
+    def _train(self, arm: str, seed: int, place: Path) -> None:
+        run = self.run_of(arm, seed)
+        trainer = trainer_of(run)(run, self.dataset, output_folder(place), self.devices, watched=self.held_out)
+        if self.devices.main:
+            run.save(place)
+        if has_checkpoints(place):
+            trainer.resume()
+        else:
+            trainer.start(self._first(arm, seed))
+        if self.config.frozen:
+            self._share_features(trainer, arm)
+        trainer.train()
+
+    def _first(self, arm: str, seed: int) -> Network:
+        """Where a run begins; random trunks differ by seed unless they stay as they are."""
+        preset = self.base.preset
+        if arm == self.arms[-1]:
+            return self.pretrained
+        if preset.model == FIELD:
+            return self.base.create(seed)
+        file = find_weights(preset.weights) if arm == IMAGENET else None
+        weights = load_weights(file, preset.trunk) if file else None
+        trunk_seed = self.config.seeds[0] if self.config.frozen else seed
+        made = create(preset.trunk, preset.heads, trunk_seed, weights)
+        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(key_of(seed + 1))))
+
+    def _share_features(self, trainer: Trainer, arm: str) -> None:
+        """The features of a frozen trunk, kept in a file for its other seeds and for a run that goes on."""
+        path, fingerprint = self.folder / "features" / f"{_name(arm)}.npz", self.dataset.fingerprint
+        kept = _kept_features(path)
+        if str(kept.pop("dataset", None)) == fingerprint:
+            trainer.features = kept
+            return
+        save_npz(output_folder(path.parent) / path.name, dataset=fingerprint, **trainer.features)
+
+
+def _kept_features(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file of features; none where there is no file or it is damaged, since they can be made anew."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            return dict(file)
+    except Exception:  # NumPy and zipfile raise all sorts over a damaged file
+        return {}
+
+
+def _name(arm: str) -> str:
+    return arm.lower().replace(" + ", "_")
+
+
+def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
+    """Samples of the test maps of each site."""
+    test = dataset.maps_of("test")
+    require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
+    sites = list(dict.fromkeys(dataset.group[test].tolist()))
+    each, seed = config.each or len(dataset.actions), config.training.drawn_by
+    of = lambda site: natural_sample(dataset.labels, test[dataset.group[test] == site], seed, len(test), each)
+    return {site: of(site) for site in sites}
+
+
+def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
+    """The rows of all runs by arm and seed, those of one seed after the other; on_run is told which one begins."""
+    results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
+    for arm in transfer.arms:
+        for seed in transfer.config.seeds:
+            on_run(arm, seed)
+            results[arm][seed] = transfer.rows(arm, seed)
+    return results

@@ -1,0 +1,206 @@
+"""The hazard-field estimator: one pass over a map for all trajectories.
+
+A U-Net turns elevation into a few channels at every node, which are made once for a map. The hazard of a pose - a logit
+and a margin for each event - is a small network of these channels at the pose's stencil (pose_stencil.py), the same at
+every place and heading, so the field is defined at any pose and not at bins of them. A trajectory's logit is the
+log-sum-exp of its poses' logits, its margin the largest of theirs; first arcs are read once for all second arcs after
+them.
+"""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jax import lax
+from jaxtyping import Array, Float
+
+from travjax.config import require, require_number
+from travjax.jax_flags import key_of, usual_flags
+from travjax.models.pose_stencil import PLACES, Stencil
+from travjax.resnet.convolution import convolve
+from travjax.resnet.network import ConvNorm
+from travjax.simulation.traverse import EVENTS
+
+RELIEF = 9
+"""Nodes along the edge of the window whose mean is taken off the elevation for the first input channel."""
+
+COARSE = 5.0
+"""Elevation scales that count as 1 in the second, where the map's large forms are seen."""
+
+FIRST_LOGIT = -6.0
+"""Of each pose, before training: failures are rare, and a trajectory has many poses."""
+
+_he_normal = nnx.initializers.he_normal()
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Size and conventions of the hazard-field estimator.
+
+    stem:          channels at full resolution
+    widths:        channels of each level of the U-Net, the first at half resolution
+    channels:      channels at each node that poses read, the elevation itself among them
+    hidden:        units of each of the two layers that make a pose's hazard of them
+    margin_weight: weight of the margins in the loss, beside the cross-entropy of the failures
+    epsilon, momentum: of batch normalisation, as in the ResNet
+    dtype:         type of the U-Net's activations, "float32" or "bfloat16"
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    stem: int = 16
+    widths: tuple[int, ...] = (32, 64)
+    channels: int = 8
+    hidden: int = 64
+    margin_weight: float = 1.0
+    epsilon: float = 1e-5
+    momentum: float = 0.95
+    dtype: str = "float32"
+
+    def __post_init__(self):
+        whole = lambda value, least: type(value) is int and least <= value <= 1024
+        several = isinstance(self.widths, tuple) and all(whole(width, 1) for width in self.widths)
+        require(several and 1 <= len(self.widths) <= 6, "widths", self.widths, "1 to 6 whole numbers from 1 to 1024")
+        for name, least in (("stem", 1), ("channels", 2), ("hidden", 1)):
+            value = getattr(self, name)
+            require(whole(value, least), name, value, f"a whole number from {least} to 1024")
+        require_number("margin_weight", self.margin_weight, -1e-300, 1000, "from 0 to 1000")
+        require_number("epsilon", self.epsilon, 0, 0.1, "above 0 and at most 0.1")
+        require_number("momentum", self.momentum, 0, 1, "above 0 and at most 1")
+        require(self.dtype in ("float32", "bfloat16"), "dtype", self.dtype, '"float32" or "bfloat16"')
+
+
+class Block(nnx.Module):
+    """Two convolutions of 3 x 3 beside a shortcut."""
+
+    def __init__(self, width: int, config: FieldConfig, *, rngs: nnx.Rngs):
+        self.first = ConvNorm(width, width, 3, 1, config, rngs=rngs)
+        self.second = ConvNorm(width, width, 3, 1, config, rngs=rngs)
+
+    def __call__(self, images: Float[Array, "b rows cols c"], train: bool) -> Float[Array, "b rows cols c"]:
+        return jax.nn.relu(images + self.second(jax.nn.relu(self.first(images, train)), train))
+
+
+class UNet(nnx.Module):
+    """Elevation to channels at each node (after Ronneberger et al. 2015, arXiv 1505.04597)."""
+
+    def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
+        widths, steps = config.widths, list(zip(config.widths, config.widths[1:], strict=False))
+        learned = config.channels - 1
+        self.config = config
+        self.stem = ConvNorm(2, config.stem, 3, 1, config, rngs=rngs)
+        self.half = ConvNorm(config.stem, widths[0], 3, 2, config, rngs=rngs)
+        self.encoder = nnx.List([Block(width, config, rngs=rngs) for width in widths])
+        self.down = nnx.List([ConvNorm(upper, lower, 3, 2, config, rngs=rngs) for upper, lower in steps])
+        self.up = nnx.List([ConvNorm(lower, upper, 1, 1, config, rngs=rngs) for upper, lower in steps])
+        self.decoder = nnx.List([Block(upper, config, rngs=rngs) for upper, _ in steps])
+        self.fine = nnx.Param(_he_normal(rngs.params(), (3, 3, config.stem, learned), jnp.float32))
+        self.coarse = nnx.Param(_he_normal(rngs.params(), (1, 1, widths[0], 4 * learned), jnp.float32))
+
+    def __call__(self, elevation: Float[Array, "b rows cols"], train: bool) -> Float[Array, "b rows cols c"]:
+        """elevation: of which one elevation scale is 1; with `train`, by the batch's statistics, as ConvNorm."""
+        relief = elevation - _window_means(elevation)
+        inputs = jnp.stack([relief, elevation / COARSE], axis=-1).astype(self.config.dtype)
+        stem = jax.nn.relu(self.stem(inputs, train))
+        images = jax.nn.relu(self.half(stem, train))
+        levels = []
+        for level, block in enumerate(self.encoder):
+            images = block(images, train)
+            if level < len(self.down):
+                levels.append(images)
+                images = jax.nn.relu(self.down[level](images, train))
+        for level in reversed(range(len(self.down))):
+            upper = levels[level]
+            images = upper + _doubled(jax.nn.relu(self.up[level](images, train)), upper.shape[1:3])
+            images = self.decoder[level](images, train)
+        dtype = images.dtype
+        fine = convolve(stem, self.fine[...].astype(dtype), 1, 1)
+        coarse = _four_nodes(convolve(images, self.coarse[...].astype(dtype)), elevation.shape[1:])
+        learned = (fine + coarse).astype(jnp.float32)
+        return jnp.concatenate([learned, elevation[..., None]], axis=-1)
+
+
+class PoseHead(nnx.Module):
+    """The channels at a pose's stencil to its logits and margins."""
+
+    def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
+        inputs, hidden, outputs = (PLACES + 1) * config.channels, config.hidden, 2 * len(EVENTS)
+        self.first = nnx.Linear(inputs, hidden, use_bias=False, kernel_init=_he_normal, rngs=rngs)
+        self.bias = nnx.Param(jnp.zeros(hidden, jnp.float32))
+        self.second = nnx.Linear(hidden, hidden, kernel_init=_he_normal, rngs=rngs)
+        self.hazard = nnx.Linear(hidden, outputs, rngs=rngs)
+        self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0], jnp.float32), len(EVENTS)))
+
+    def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b 6"]:
+        """Three logits, then three margins in units of the robot's limits.
+
+        The ground is seen relative to its mean over the stencil, and the mean beside it.
+        """
+        mean = ground.mean(axis=1, keepdims=True)
+        places = jnp.concatenate([ground - mean, mean], axis=1)
+        kernel = self.first.kernel[...].reshape(places.shape[1], places.shape[3], -1)
+        hidden = jax.nn.relu(jnp.einsum("psbc,sch->pbh", places, kernel) + self.bias[...])
+        return self.hazard(jax.nn.relu(self.second(hidden)))
+
+
+class HazardField(nnx.Module):
+    """Elevation maps to the logits and margins of all trajectories."""
+
+    def __init__(self, trunk: UNet, heads: PoseHead):
+        self.trunk = trunk
+        self.heads = heads
+
+    def __call__(
+        self, elevation: Float[Array, "b rows cols"], stencil: Stencil, *, train: bool = False
+    ) -> tuple[Float[Array, "b t 3"], Float[Array, "b t 3"]]:
+        """Logits and margins, the margins in units of the robot's limits, of the trajectories of a stencil."""
+        arcs, poses, _ = stencil.nodes.shape
+        hazard = self.at(self.trunk(elevation, train), stencil.nodes.reshape(arcs * poses, -1))
+        return read_out(hazard.reshape(arcs, poses, *hazard.shape[1:]), stencil)
+
+    def at(self, channels: Float[Array, "b rows cols c"], nodes) -> Float[Array, "p b 6"]:
+        """The field at poses of stencils [p, s], from the channels at all nodes."""
+        maps, rows, cols, count = channels.shape
+        # Maps and channels side by side: a row is read for each node, and added to in the gradient, at full width.
+        by_node = channels.reshape(maps, rows * cols, count).transpose(1, 0, 2).reshape(rows * cols, -1)
+        ground = by_node.at[nodes].get(mode="promise_in_bounds")
+        return self.heads(ground.reshape(*nodes.shape, maps, count))
+
+
+def read_out(hazard: Float[Array, "f p b 6"], stencil: Stencil) -> tuple[Float[Array, "b t 3"], Float[Array, "b t 3"]]:
+    """Logits and margins of trajectories from those of their poses, in the order of a stencil's."""
+    first, rest = hazard[:, : stencil.first_poses], hazard[:, stencil.first_poses :]
+    second = rest.reshape(len(hazard), stencil.second_arcs, -1, *hazard.shape[2:])
+    events = len(EVENTS)
+    smooth = lambda part, axis: jax.nn.logsumexp(part[..., :events], axis=axis)
+    logits = jnp.logaddexp(smooth(first, 1)[:, None], smooth(second, 2))
+    margins = jnp.maximum(first[..., events:].max(axis=1)[:, None], second[..., events:].max(axis=2))
+    by_map = lambda part: part.reshape(-1, *part.shape[2:]).swapaxes(0, 1)
+    return by_map(logits), by_map(margins)
+
+
+@usual_flags()
+def create(config: FieldConfig = FieldConfig(), seed: int = 0) -> HazardField:
+    """An estimator with random parameters."""
+    trunk, heads = (nnx.Rngs(key_of(number)) for number in (seed, seed + 1))
+    return HazardField(UNet(config, rngs=trunk), PoseHead(config, rngs=heads))
+
+
+def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:
+    """Mean of the RELIEF x RELIEF nodes around each, the map's edge repeated."""
+    edge = RELIEF // 2
+    padded = jnp.pad(elevation, ((0, 0), (edge, edge), (edge, edge)), mode="edge")
+    return lax.reduce_window(padded, 0.0, lax.add, (1, RELIEF, RELIEF), (1, 1, 1), "VALID") / RELIEF**2
+
+
+def _doubled(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols c"]:
+    """Each pixel four times, cut to a shape."""
+    return images.repeat(2, axis=1).repeat(2, axis=2)[:, : shape[0], : shape[1]]
+
+
+def _four_nodes(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols _c"]:
+    """Four groups of channels at half resolution as the nodes (0, 0), (0, 1), (1, 0) and (1, 1) from each on."""
+    maps, rows, cols, channels = images.shape
+    spread = images.reshape(maps, rows, cols, 2, 2, channels // 4).transpose(0, 1, 3, 2, 4, 5)
+    return spread.reshape(maps, 2 * rows, 2 * cols, channels // 4)[:, : shape[0], : shape[1]]

@@ -1,0 +1,364 @@
+"""Checkpoints of training, written by Orbax: whole or not at all, checked when they are read.
+
+A folder holds one sub-folder a checkpoint, numbered in the order they were saved:
+
+    000007-step-1200-best/   state/       the arrays, in Orbax's format
+                             meta.json    what the caller says of the checkpoint, and dtype and shape of its arrays
+                             SHA256SUMS   of every other file, written last; `sha256sum -c SHA256SUMS` reads it too
+    000008-heads/            one that was saved under a name
+
+A checkpoint is written to a temporary folder and renamed: a kill at any moment leaves the earlier ones as they were.
+"""
+
+import asyncio
+import errno
+import json
+import logging
+import os
+import re
+import shutil
+import textwrap
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import uvloop
+from flax.traverse_util import unflatten_dict
+from jax.experimental import multihost_utils
+
+from travjax.config import InputError, require
+from travjax.files import sha256, user_path
+
+FORMAT = 1
+UNFINISHED = ".unfinished-checkpoint"
+ENTRIES = 64
+"""Files and folders for which there must be room, a few more than a checkpoint has."""
+
+SPARE = 2**20
+"""Bytes for which there must be room beside those of the arrays."""
+
+NAME = "[a-z][a-z0-9_]*"
+FOLDER = re.compile(rf"(\d{{6,}})-(?:step-\d+(-best)?|({NAME}))")
+PyTree = Any
+
+
+class Checkpoints:
+    """The checkpoints in a folder: the latest few, the best, and those with a name.
+
+    In a run of several processes, which share the folder, all of them call each method with the same global arrays.
+    notices: after `restore`, a line on each damaged checkpoint that was passed over, to be printed
+    """
+
+    def __init__(self, folder: str | Path, keep_latest: int = 2):
+        require(isinstance(keep_latest, int) and keep_latest >= 1, "keep_latest", keep_latest, "an integer from 1")
+        self.folder = user_path(folder).absolute()
+        self.keep_latest = keep_latest
+        self.notices: list[str] = []
+        self._damaged: dict[Path, str] = {}
+
+    def save(self, step: int, state: PyTree, meta: dict, best: bool = False) -> None:
+        """Saves a pytree of arrays, and what JSON can hold, as the latest checkpoint and, if so marked, the best.
+
+        Raises InputError when it cannot be written, a full disk for one; the earlier ones are kept.
+        """
+        self._save(f"step-{step}{'-best' if best else ''}", state, meta)
+
+    def save_named(self, name: str, state: PyTree, meta: dict) -> None:
+        """Like `save`, but it counts neither as latest nor as best, and replaces the one of the same name."""
+        allowed = re.fullmatch(NAME, name) is not None and name not in ("latest", "best")
+        require(allowed, "name", name, "lower-case letters, digits and _, neither latest nor best")
+        self._save(name, state, meta)
+
+    def restore(self, template: PyTree = None, which: str = "latest") -> tuple[PyTree, dict]:
+        """The state and the meta of the latest, the best or a named checkpoint.
+
+        template: pytree of arrays or `jax.ShapeDtypeStruct` of the same structure, dtypes and shapes, whose shardings
+            are taken over (a NumPy array where there is none); or a function that gives it for the checkpoint's meta.
+            Without a template: nested dicts of NumPy arrays
+        A damaged checkpoint is passed over for the one before it, with a notice; one that training removes meanwhile,
+        for the newer one.
+        Raises InputError when none is good, or the template's arrays are others.
+        """
+        while True:
+            path, saved = self._newest_good(which)
+            chosen = template(saved["meta"]) if callable(template) else template
+            try:
+                return _load(path, saved["arrays"], chosen), saved["meta"]
+            except _Unreadable as error:
+                with suppress(_Damaged):  # removed or altered since it was checked
+                    _checked(path, arrays=True)
+                    raise InputError(f"{path}: {error}; allowed: another checkpoint") from None
+
+    def _newest_good(self, which: str) -> tuple[Path, dict]:
+        damaged: dict[Path, str] = {}
+        try:
+            path, saved = _newest_good(self.folder, which, damaged, arrays=True)
+        finally:
+            self._damaged |= damaged
+            self.notices = [f"{path}: damaged checkpoint passed over: {why}" for path, why in damaged.items()]
+        if damaged:
+            self.notices.append(f"{path}: is used instead")
+        return path, saved
+
+    def _save(self, label: str, state: PyTree, meta: dict) -> None:
+        arrays = _named_leaves(state)
+        text = json.dumps({"format": FORMAT, "meta": meta, "arrays": _described(arrays)})
+        unfinished = self.folder / UNFINISHED
+
+        def begin() -> None:
+            shutil.rmtree(unfinished, ignore_errors=True)  # of a run that was killed
+            unfinished.mkdir(parents=True)
+            _require_room(unfinished, sum(leaf.nbytes for leaf in arrays.values()) + len(text))
+
+        def write_arrays() -> None:
+            with _quiet_orbax() as ocp:
+                context = ocp.Context()
+                context.array.saving.use_compression = False  # saves 8 % of the space in seven times the time
+                with context:
+                    ocp.save(unfinished / "state", arrays)
+
+        def finish() -> None:
+            (unfinished / "meta.json").write_text(text)
+            sums = [f"{sha256(file)}  {name}\n" for name, file in _files(unfinished).items()]
+            (unfinished / "SHA256SUMS").write_text("".join(sums))
+            number = max((number for number, _, _ in _checkpoints(self.folder)), default=0) + 1
+            unfinished.rename(self.folder / f"{number:06d}-{label}")
+            self._remove_superseded()
+
+        first = jax.process_index() == 0
+        try:
+            self._together(begin, first)
+            self._together(write_arrays, True)
+            self._together(finish, first)
+        finally:
+            if first:
+                shutil.rmtree(unfinished, ignore_errors=True)
+
+    def _together(self, work: Callable[[], None], mine: bool) -> None:
+        """Does the work if it is mine and waits for the other processes; raises in all if it failed in one."""
+        reason = ""
+        try:
+            if mine:
+                work()
+        except (OSError, ValueError) as error:
+            reason = _reason(error)
+        failed = bool(reason)
+        if jax.process_count() > 1:
+            failed = bool(np.any(multihost_utils.process_allgather(np.array(failed))))
+        if failed:
+            why = reason or "another process failed"
+            raise InputError(f"{self.folder}: checkpoint cannot be written: {why}; the earlier ones are kept")
+
+    def _remove_superseded(self) -> None:
+        good = [(kind, path) for _, kind, path in _checkpoints(self.folder) if path not in self._damaged]
+        newest = {path for kind, path in dict(reversed(good)).items() if kind != "latest"}
+        latest = [path for kind, path in good if kind in ("latest", "best")][: self.keep_latest]
+        for _, _, path in _checkpoints(self.folder):
+            if path not in newest and path not in latest:
+                unfinished = path.rename(self.folder / UNFINISHED)  # so that no half of it is left as a checkpoint
+                shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def load_meta(folder: str | Path, which: str = "latest") -> dict:
+    """The meta of a checkpoint alone: its arrays are neither read nor checked, and Orbax is not imported.
+
+    Raises InputError like `Checkpoints.restore`.
+    """
+    return _newest_good(user_path(folder).absolute(), which, {}, arrays=False)[1]["meta"]
+
+
+def _checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
+    """Number, kind (latest, best or a name) and path of the checkpoints, newest first."""
+    matches = [(FOLDER.fullmatch(path.name), path) for path in folder.iterdir()]
+    return sorted(((int(m[1]), "best" if m[2] else m[3] or "latest", path) for m, path in matches if m), reverse=True)
+
+
+def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: bool) -> tuple[Path, dict]:
+    """The checkpoint to use and what its meta.json holds; those passed over are added to `damaged`, with the reason.
+
+    The latest ones stand in for damaged best ones.
+    """
+    try:
+        found = _checkpoints(folder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be read: {error.strerror}; allowed: a folder with checkpoints") from None
+    steps = [path for _, kind, path in found if kind in ("latest", "best")]
+    paths = steps if which == "latest" else [path for _, kind, path in found if kind == which]
+    if not paths:
+        there = sorted({kind for _, kind, _ in found} | {"latest" for _ in steps})
+        raise InputError(f"{folder}: holds no checkpoint {which!r}; it holds: {', '.join(there) or 'none at all'}")
+    for path in dict.fromkeys(paths + steps if which == "best" else paths):
+        try:
+            return path, _checked(path, arrays)
+        except _Damaged as error:
+            if _checkpoints(folder) != found:  # training goes on there, and may have removed it for a newer one
+                damaged.clear()
+                return _newest_good(folder, which, damaged, arrays)
+            damaged[path] = str(error)
+    reasons = "; ".join(f"{path.name}: {why}" for path, why in damaged.items())
+    raise InputError(f"{folder}: holds no checkpoint {which!r} that is whole: {reasons}")
+
+
+class _Damaged(Exception):
+    """What is wrong with a checkpoint's files."""
+
+
+class _Unreadable(Exception):
+    """Why Orbax cannot read arrays."""
+
+
+def _checked(path: Path, arrays: bool) -> dict:
+    """What meta.json holds, once the files (without `arrays`: meta.json alone) are those of SHA256SUMS, else _Damaged.
+
+    Raises InputError for another format version.
+    """
+    try:
+        sums = dict(line.split("  ", 1)[::-1] for line in (path / "SHA256SUMS").read_text().splitlines())
+        files = _files(path)
+        for name in sorted(sums.keys() ^ files.keys()):
+            raise _Damaged(f"{name} is {'missing' if name in sums else 'not in SHA256SUMS'}")
+        for name in sums if arrays else ["meta.json"]:
+            if sha256(files[name]) != sums[name]:
+                raise _Damaged(f"{name} is altered or truncated")
+        saved = json.loads((path / "meta.json").read_text())
+    except OSError as error:
+        raise _Damaged(f"{Path(error.filename or path).name} cannot be read: {error.strerror}") from None
+    except (ValueError, KeyError):
+        raise _Damaged("SHA256SUMS is altered or truncated") from None
+    if saved["format"] != FORMAT:
+        raise InputError(f"{path}: format = {saved['format']}: must be {FORMAT}, that of this version of travjax")
+    return saved
+
+
+def _files(path: Path) -> dict[str, Path]:
+    """The files by path, but hidden ones, which Finder, NFS and the like leave there and Orbax does not read."""
+    files = sorted(file for file in path.rglob("*") if not file.is_dir() and file.name != "SHA256SUMS")
+    named = {file.relative_to(path).as_posix(): file for file in files}
+    return {name: file for name, file in named.items() if not f"/{name}".count("/.")}
+
+
+def _named_leaves(tree: PyTree) -> dict[str, Any]:
+    """The leaves by path: trunk/conv1/kernel."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+    if len(named) != len(leaves) or not named:
+        raise InputError("the state has no arrays, or two of one path")
+    return named
+
+
+def _described(leaves: dict[str, Any]) -> dict[str, list]:
+    """Dtype and shape of arrays. Raises InputError for what Orbax cannot hold; it would hang on an empty array."""
+    for name, leaf in leaves.items():
+        numbers = hasattr(leaf, "dtype") and not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended)
+        require(numbers and 0 not in leaf.shape, name, leaf, "an array of numbers that is not empty")
+    return {name: [np.dtype(leaf.dtype).name, list(leaf.shape)] for name, leaf in leaves.items()}
+
+
+def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
+    leaves = {} if template is None else _named_leaves(template)
+    if template is not None:
+        _require_same(path, saved, _described(leaves))
+    abstract = {}
+    for name, (dtype, shape) in saved.items():
+        sharding = getattr(leaves.get(name), "sharding", None)
+        blank = np.broadcast_to(np.zeros((), jax.numpy.dtype(dtype)), shape)
+        abstract[name] = blank if sharding is None else jax.ShapeDtypeStruct(shape, blank.dtype, sharding=sharding)
+    try:
+        with _quiet_orbax() as ocp:
+            arrays = ocp.load(path / "state", abstract)
+    except MemoryError:
+        raise
+    except Exception as error:  # Orbax and TensorStore raise whatever their parsers do; the checksums were in order
+        reason = textwrap.shorten(_reason(error), 80, placeholder=" ...")
+        raise _Unreadable(f"state: cannot be read: {reason}") from None
+    if template is None:
+        return unflatten_dict(arrays, sep="/")
+    return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in leaves])
+
+
+def _require_same(path: Path, saved: dict[str, list], wanted: dict[str, list]) -> None:
+    """Raises InputError that names the first arrays of a checkpoint that are not those wanted."""
+    shown = lambda array: "{}{}".format(*array) if array else "missing"
+    names = [name for name in {**wanted, **saved} if saved.get(name) != wanted.get(name)]
+    if names:
+        each = [f"{n} is {shown(saved.get(n))} here and {shown(wanted.get(n))} there" for n in names[:3]]
+        more = f"; and {len(names) - 3} more" if len(names) > 3 else ""
+        raise InputError(f"{path}: other arrays than the network and optimiser have: {'; '.join(each)}{more}")
+
+
+def _require_room(folder: Path, size: int) -> None:
+    """Raises OSError where a checkpoint of so many bytes has no room: Orbax finds out late, and may hang then."""
+    places = [folder / f"room-{number}" for number in range(ENTRIES)]
+    for place in places:
+        place.touch()
+    try:
+        with places[0].open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size + SPARE)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT):
+            raise  # else it is one file of that size that cannot be
+    for place in places:
+        place.unlink()
+
+
+def _reason(error: Exception) -> str:
+    """One line. TensorStore reports a full disk and the like as a ValueError that holds the system's error number."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    if code := re.search(r"os_error_code='(\d+)'", str(error)):
+        return os.strerror(int(code[1]))
+    return textwrap.shorten(str(error), 200, placeholder=" ...")
+
+
+def _not_from_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in Path(record.pathname).parts
+
+
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that ends no earlier than its tasks and threads.
+
+    Orbax closes its own at the first error, while others of its reads and writes are under way: they would go on, each
+    would print a traceback, and what is removed would be made again.
+    """
+
+    def close(self) -> None:
+        if not self.is_closed():
+            self.run_until_complete(self._finish())
+        super().close()
+
+    async def _finish(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        await asyncio.gather(*others, return_exceptions=True)
+        await self.shutdown_default_executor()
+
+
+class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+    _loop_factory = _PatientLoop
+
+
+@contextmanager
+def _patient_loops() -> Iterator[None]:
+    """Makes the loops of asyncio, and those of uvloop that Orbax runs beside one, patient ones."""
+    policy, new_event_loop = asyncio.get_event_loop_policy(), uvloop.new_event_loop
+    asyncio.set_event_loop_policy(_PatientPolicy())
+    uvloop.new_event_loop = lambda: _PatientLoop()  # type: ignore
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(policy)
+        uvloop.new_event_loop = new_event_loop
+
+
+@contextmanager
+def _quiet_orbax() -> Iterator[Any]:
+    """Orbax with patient loops, without its warnings and its log; its threads also log each error that it raises."""
+    logging.getLogger("absl").addFilter(_not_from_orbax)  # adding it again changes nothing
+    with warnings.catch_warnings(), _patient_loops():
+        warnings.simplefilter("ignore")
+        from orbax.checkpoint import v1 as ocp
+
+        yield ocp

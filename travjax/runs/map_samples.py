@@ -1,0 +1,128 @@
+"""What the hazard field is trained on and reads: whole maps, with all their trajectories.
+
+Each step sees a few maps, after some quarter turns in one of the views in which the action space looks like itself
+(footprint.py), corrupted or not, and the trajectories of a few first arcs of each. Labels are the simulator's margins
+on the clean map, so they are exact in every view. All that is random follows from the training seed and the step.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from travjax.config import require
+from travjax.data.dataset import Dataset
+from travjax.data.sampling import Samples, batches, every_sample
+from travjax.data.sensor_noise import corrupted, filled
+from travjax.jax_flags import usual_flags
+from travjax.models.pose_stencil import Stencil, stencil
+from travjax.runs.preset import Preset
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.footprint import views_of
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import simulate, unpacked
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["heights", "stencil", "elevation_scale"], meta_fields=[])
+@dataclass(frozen=True)
+class MapSource:
+    """Maps for the hazard field, on the device.
+
+    heights: [n, rows, cols] metres, none unknown; stencil: of all trajectories; elevation_scale: metres that count as 1
+    """
+
+    heights: Float[Array, "n rows cols"] | Float[np.ndarray, "n rows cols"]
+    stencil: Stencil
+    elevation_scale: float | np.float32
+
+    @staticmethod
+    def of(heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float) -> "MapSource":
+        """heights: [n, rows, cols] metres; an unknown node gets the height of the nearest known one."""
+        return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
+
+    def elevation(self, map_index: Int[Array, " b"]) -> Float[Array, "b rows cols"]:
+        """What the network sees of maps."""
+        return relative(self.heights[map_index], self.elevation_scale)
+
+
+def relative(heights, scale):
+    """Heights [b, rows, cols] above that at the centre, in units of a scale."""
+    middle = heights.shape[-1] // 2
+    return (heights - heights[:, middle, middle, None, None]) / scale
+
+
+class MapData:
+    """The training and validation maps of a data set.
+
+    Raises InputError when there are none of either.
+    """
+
+    def __init__(self, dataset: Dataset, preset: Preset):
+        self.dataset, self.preset, self.config = dataset, preset, preset.training
+        self.maps = dataset.maps_of("train")
+        for split, count in (("train", len(self.maps)), ("validation", len(self.validation[0]))):
+            require(count > 0, f"data set, {split} split", count, "at least one map with a known trajectory")
+
+    @cached_property
+    def validation(self) -> Samples:
+        """All known trajectories of so many validation maps as make `validation_samples`, one map at least."""
+        maps = self.dataset.maps_of("validation")
+        count = max(self.config.validation_samples // len(self.dataset.actions), 1)
+        return every_sample(self.dataset.labels, maps[:: max(len(maps) // count, 1)][:count])
+
+    def failed(self, samples: Samples) -> np.ndarray:
+        """Failures of samples: [k, 3] float32."""
+        return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
+
+    def count(self, phase: int, epoch: int) -> int:
+        """Maps of an epoch."""
+        return len(self.maps)
+
+    def steps(self, phase: int, epoch: int = 0) -> int:
+        """Batches of an epoch."""
+        return -(-len(self.maps) // self.config.batch_size)
+
+    def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, None, np.ndarray]]:
+        """Maps [b] and weights [b] of each step, as `TrainingData.batches`."""
+        chosen, _, weights = batches((self.maps, self.maps), self.config.batch_size, self.config.seed, epoch)
+        for maps, weight in zip(chosen, weights, strict=True):
+            yield maps, None, weight
+
+    @usual_flags()  # in a thread of its own
+    def prepared(self, maps: np.ndarray, step: int):
+        """Inputs and targets of a step on maps [b], as training/step.py takes them."""
+        data, preset, rng = self.dataset, self.preset, np.random.default_rng((self.config.seed, step))
+        views = views_of(data.actions)
+        view = views[rng.integers(len(views))]
+        heights = np.ascontiguousarray(np.rot90(data.heights[maps], int(rng.integers(4)), axes=(1, 2)))
+        margins = simulate(heights, data.robot, data.actions, grid=data.grid)
+        table = stencil(data.robot, data.actions, data.grid)
+        arcs = self._arcs(table, rng)
+        trajectories = (arcs[:, None] * table.second_arcs + np.arange(table.second_arcs)).ravel()
+        targets = _targets(margins.events(), view.trajectories(data.actions)[trajectories], data.robot.limits)
+        seen = np.flip(heights, tuple(axis + 1 for axis in view.flipped))
+        seen = corrupted(filled(seen), preset.corruption, rng)
+        part = Stencil(table.nodes[arcs], table.first_poses, table.second_arcs)
+        return (relative(seen, np.float32(preset.elevation_scale)), part), targets
+
+    def _arcs(self, table: Stencil, rng: np.random.Generator) -> np.ndarray:
+        """First arcs whose trajectories a step sees."""
+        count = min(max(self.config.each // table.second_arcs, 1), len(table.nodes))
+        return np.sort(rng.choice(len(table.nodes), count, replace=False))
+
+    def summary(self) -> str:
+        """What is trained on, for people."""
+        return f"{len(self.maps)} training maps; {len(self.validation[0])} validation samples"
+
+
+@partial(jax.jit, static_argnames="limits")
+def _targets(margins, trajectories, limits):
+    """Margins of trajectories in units of the limits, and whether they are known."""
+    chosen = margins[:, trajectories] / jnp.asarray(limits, jnp.float32)
+    known = ~jnp.isnan(chosen[..., 0])
+    return jnp.where(known[..., None], chosen, 0), known

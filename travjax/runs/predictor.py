@@ -1,0 +1,127 @@
+"""Probabilities of failure for the whole action space, from maps alone, by a trained estimator."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from travjax.config import InputError, require
+from travjax.data.sampling import Samples
+from travjax.devices import Devices
+from travjax.files import user_path
+from travjax.jax_flags import usual_flags
+from travjax.models.trajectory_resnet import take_apart
+from travjax.runs.inference import NoNumbers, hazards, logits_of, probabilities
+from travjax.runs.map_samples import MapSource
+from travjax.runs.model_file import SUFFIX, read_model
+from travjax.runs.run import Network, Run, load_estimator
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import HIGHEST, Grid
+from travjax.simulation.heights import Heights, as_maps
+from travjax.simulation.robot import Robot
+
+WEIGHTS = Path(__file__).parent / "weights"
+"""The estimators that come with the package."""
+
+DEFAULT = "field_seekur_jr"
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What an estimator says of the trajectories of maps.
+
+    probability: [n, t, 3] of step, obstacle and tilt failures
+    margins:     [n, t, 3] metres, metres, radians; None of an estimator that has none
+    """
+
+    probability: Float[np.ndarray, "*n t 3"]
+    margins: Float[np.ndarray, "*n t 3"] | None
+
+
+@dataclass(frozen=True, repr=False)
+class Predictor:
+    """A trained estimator, the run that it comes from, and the file or folder that it was read from."""
+
+    run: Run
+    network: Network
+    source: Path | None = None
+
+    def __repr__(self) -> str:
+        run = self.run
+        return (
+            f"Predictor({run.preset.model} for {run.robot.name},\n"
+            f"          {len(run.actions)} trajectories of maps of {run.grid.size:g} x {run.grid.size:g} m at "
+            f"{run.grid.spacing:g} m)"
+        )
+
+    @staticmethod
+    @usual_flags()
+    def load(source: str | Path | None = None, which: str = "best") -> "Predictor":
+        """The estimator of a file, of a training run's folder, or the one that comes with the package.
+
+        which: checkpoint of a folder
+        Raises InputError when there is none, or it is damaged.
+        """
+        path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else user_path(source)
+        if path.is_dir():
+            return Predictor(*load_estimator(path, which)[:2], path)
+        if path.suffix != SUFFIX:
+            raise InputError(f"{path}: no estimator; allowed: the folder of a training run, or a {SUFFIX} file")
+        return Predictor(*read_model(path)[:2], path)
+
+    def require_same(self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None):
+        """Raises InputError that names both when something else is given than the estimator was trained for."""
+        run = self.run
+        if robot:
+            same = " of other dimensions or limits" if robot.name == run.robot.name else ""
+            allowed = f"{run.robot.name}{same}, which the estimator was trained for"
+            require(robot == run.robot, "robot", robot.name, allowed)
+        for name, given, own in (("actions", actions, run.actions), ("grid", grid, run.grid)):
+            require(given in (None, own), name, given, f"{own}, which the estimator was trained for")
+
+    @usual_flags()
+    def predict(self, heights: Heights, on_progress: Callable[[int], object] = lambda count: None) -> Predicted:
+        """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid; heights as `simulate` takes
+        them.
+
+        An unknown node counts as the nearest known one to the hazard field, and as in SPEC section 6 to the ResNet.
+        on_progress: is told how many trajectories were added
+        Raises InputError when `simulate` would over the heights, and when the estimator puts out NaN or infinity.
+        """
+        checked, alone = as_maps(heights, self.run.grid)
+        maps = np.asarray(checked)
+        maps = np.where(np.abs(maps) <= HIGHEST, maps, np.nan)  # those of a jax array may be anything
+        try:
+            logits, margins = self._outputs(maps, on_progress)
+        except NoNumbers as error:
+            raise InputError(f"{self.source}: {error}" if self.source else str(error)) from None
+        one = (lambda array: array[0]) if alone else (lambda array: array)
+        return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
+
+    def _outputs(self, maps: np.ndarray, on_progress: Callable[[int], object]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Logits and margins of the trajectories of maps: [n, t, 3] each, no margins of an estimator without any."""
+        graph, variables = take_apart(self.network)
+        devices = Devices.all()
+        variables, source = devices.replicate(variables), devices.replicate(self.run.source(maps))
+        every, trajectories = np.arange(len(maps)), len(self.run.actions)
+        if isinstance(source, MapSource):
+            told = lambda count: on_progress(count * trajectories)
+            logits, margins = np.split(hazards(graph, variables, source, every, devices, told), 2, axis=-1)
+            return logits, margins * np.asarray(self.run.robot.limits, np.float32)
+        samples: Samples = (np.repeat(every, trajectories), np.tile(np.arange(trajectories), len(maps)))
+        size = 64 * devices.mesh.size
+        logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
+        return logits.reshape(len(maps), trajectories, -1), None
+
+
+def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t 3"]:
+    """Probabilities of step, obstacle and tilt failures for every trajectory of every map.
+
+    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model is for others
+    model:   folder of a training run, or .safetensors file; the hazard field for the Seekur Jr that comes with the
+             package unless given
+    Returns [n, t, 3], or [t, 3] for one map. Raises InputError for heights or a model that cannot be.
+    """
+    return Predictor.load(model).predict(heights).probability

@@ -1,0 +1,182 @@
+"""Everything that a training run is made from, as one TOML file (experiments/train/*.toml)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import optax
+
+from travjax.config import load_toml, require, require_length, require_number
+from travjax.data.dataset import DatasetConfig
+from travjax.data.sensor_noise import CorruptionConfig
+from travjax.files import find_data
+from travjax.models.hazard_field import FieldConfig
+from travjax.models.names import FIELD, MODELS, RESNET
+from travjax.models.trajectory_resnet import HeadsConfig
+from travjax.resnet.network import ResNetConfig
+
+SCHEDULES = ("constant", "cosine")
+
+METHODS = ("rmsprop", "adamw")
+
+MOST = 2**31 - 1
+"""Of anything that is counted, and the largest seed."""
+
+
+def _require_counts(config: object, *names: str, least: int) -> None:
+    for name in names:
+        value = getattr(config, name)
+        require(type(value) is int and value >= least, name, value, f"a whole number, at least {least}")
+        require(value <= MOST, name, value, f"at most {MOST}")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How the network is trained (SPEC section 9).
+
+    A sample is a map and a trajectory; for the hazard field it is a map.
+
+    seed:                 of the subsets, their order, the heads' first values and dropout
+    batch_size:           samples a step
+    head_epochs:          phase 1: epochs of the heads on the features of the frozen trunk
+    epochs:               phase 2: epochs of everything
+    method:               "rmsprop", or "adamw" with its usual settings
+    learning_rate:        its largest
+    decay, epsilon:       of RMSprop
+    clip:                 gradients longer than this are cut to it; 0 leaves them as they are
+    schedule:             of phase 2: "constant", or "cosine" down to zero
+    warmup_steps:         steps of phase 2 over which the learning rate rises from zero
+    weight_decay:         times the sum of squares of the heads' kernels, added to the loss; with "adamw" its own decay
+    each, failing:        trajectories a map in an epoch, and how many of them fail if as many do; for the hazard field
+                          trajectories a map in a step, whole first arcs of them, as frequent as they are
+    fresh:                a new subset of trajectories each epoch instead of the same one (phase 2)
+    subset_seed:          of the subsets alone, so that runs of other seeds train on the same samples; `seed` if none
+    validation_samples:   at most this many of the validation maps' balanced subset
+    checkpoint_steps:     steps from one checkpoint to the next; there is one after each epoch as well
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    seed: int = 0
+    batch_size: int = 64
+    head_epochs: int = 1
+    epochs: int = 10
+    method: str = "rmsprop"
+    learning_rate: float = 1e-4
+    decay: float = 0.9
+    epsilon: float = 1e-7
+    clip: float = 0.0
+    schedule: str = "constant"
+    warmup_steps: int = 0
+    weight_decay: float = 0.001
+    each: int = 11
+    failing: int = 6
+    fresh: bool = False
+    subset_seed: int | None = None
+    validation_samples: int = 100_000
+    checkpoint_steps: int = 500
+
+    def __post_init__(self):
+        _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing", least=0)
+        _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
+        if self.subset_seed is not None:
+            _require_counts(self, "subset_seed", least=0)
+        require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
+        require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
+        require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
+        require_number("epsilon", self.epsilon, 0, 1, "above 0 and at most 1")
+        require_number("clip", self.clip, -1e-300, 1e6, "from 0 to 1000000")
+        require(self.method in METHODS, "method", self.method, f"one of {', '.join(METHODS)}")
+        require_number("weight_decay", self.weight_decay, -1e-300, 10, "from 0 to 10")
+        require(self.schedule in SCHEDULES, "schedule", self.schedule, f"one of {', '.join(SCHEDULES)}")
+        require(type(self.fresh) is bool, "fresh", self.fresh, "true or false")
+        require(self.head_epochs + self.epochs > 0, "epochs", self.epochs, "at least 1 where head_epochs is 0")
+
+    @property
+    def drawn_by(self) -> int:
+        """The seed of the subsets."""
+        return self.seed if self.subset_seed is None else self.subset_seed
+
+    def schedule_of(self, phase: int, steps: int) -> optax.Schedule:
+        """The learning rate of each of the `steps` of a phase; it varies in phase 2 only."""
+        rate, warmup = self.learning_rate, self.warmup_steps
+        if phase == 1 or self.schedule == "constant" and not warmup:
+            return optax.constant_schedule(rate)
+        if self.schedule == "constant":
+            return optax.warmup_constant_schedule(0.0, rate, warmup)
+        return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, max(steps, warmup + 1))
+
+    def optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
+        """The method for the `steps` of a phase."""
+        rate = self.schedule_of(phase, steps)
+        if self.method == "adamw":
+            made = optax.adamw(rate, weight_decay=self.weight_decay)
+        else:
+            made = optax.rmsprop(rate, self.decay, self.epsilon, eps_in_sqrt=False)
+        return optax.chain(optax.clip_by_global_norm(self.clip), made) if self.clip else made
+
+    @property
+    def penalty(self) -> float:
+        """The weight decay that is part of the loss."""
+        return 0.0 if self.method == "adamw" else self.weight_decay
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The sample of the test maps that is evaluated, at natural frequency.
+
+    maps: test maps; each: random trajectories of each map; 0 for all
+    """
+
+    maps: int = 0
+    each: int = 0
+
+    def __post_init__(self):
+        _require_counts(self, "maps", "each", least=0)
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A training run.
+
+    model:           the estimator, one of MODELS
+    robot:           a preset or a .toml file
+    weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones
+    elevation_scale: metres that count as 1 in the elevation channel
+
+    The rest are the tables of the file: trunk and heads are those of the ResNet, field is the hazard field's, and so is
+    corruption, what it sees of its training maps.
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    model: str = RESNET
+    robot: str = "seekur_jr"
+    weights: str = "imagenet/resnet50_imagenet.npz"
+    elevation_scale: float = 1.0
+    dataset: DatasetConfig = DatasetConfig()
+    trunk: ResNetConfig = ResNetConfig()
+    heads: HeadsConfig = HeadsConfig()
+    field: FieldConfig = FieldConfig()
+    corruption: CorruptionConfig = CorruptionConfig()
+    training: TrainingConfig = TrainingConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    def __post_init__(self):
+        require(self.model in MODELS, "model", self.model, f"one of {', '.join(MODELS)}")
+        if self.model == FIELD:
+            epochs = self.training.head_epochs
+            require(epochs == 0, "[training] head_epochs", epochs, "0: the hazard field has no frozen trunk")
+        for name in ("robot", "weights"):
+            value = getattr(self, name)
+            require(isinstance(value, str) and bool(value), name, value, "a non-empty text")
+        require_length("elevation_scale", self.elevation_scale, 0.001, 1000)
+
+    @staticmethod
+    def load(path: str | Path) -> "Preset":
+        """Reads a preset from a TOML file; raises InputError when it is missing or wrong."""
+        return load_toml(path, Preset)
+
+
+def find_weights(name: str) -> Path | None:
+    """The file of a preset's `weights`, None for "none"; raises InputError when there is none."""
+    return None if name == "none" else find_data(name, "weights", "--weights FILE, or none for random ones")

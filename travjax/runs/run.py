@@ -1,0 +1,191 @@
+"""A training run's folder: what was trained on what (run.json), and its checkpoints."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax import nnx
+
+import travjax.models.hazard_field
+import travjax.models.trajectory_resnet
+from travjax.config import InputError, one_line, parts_from_json, read_json, require, shown, to_json
+from travjax.files import save_text, user_path
+from travjax.jax_flags import usual_flags
+from travjax.models.hazard_field import HazardField
+from travjax.models.input_images import ImageSource
+from travjax.models.names import FIELD
+from travjax.models.trajectory_resnet import VARIABLES, Estimator, put_together, take_apart
+from travjax.resnet.imagenet_weights import Weights
+from travjax.resnet.weight_files import require_finite
+from travjax.runs.checkpoint import Checkpoints
+from travjax.runs.map_samples import MapSource
+from travjax.runs.preset import Preset
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+
+TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
+"""What each phase trains, and training of the hazard field."""
+
+COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
+"""What a checkpoint says of where training stood: whole numbers, and others."""
+
+DATA = "data"
+"""Folder of a run's own data set."""
+
+_PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
+
+
+Network = Estimator | HazardField
+"""An estimator of either model."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a training run is made from.
+
+    robot, actions, grid: what the labels, and so the network, hold for
+    """
+
+    preset: Preset
+    robot: Robot
+    actions: ActionSpace
+    grid: Grid
+
+    def save(self, folder: Path) -> Path:
+        """Writes run.json."""
+        return save_text(folder / "run.json", json.dumps(self.to_json(), indent=1) + "\n")
+
+    def to_json(self) -> dict[str, Any]:
+        """What JSON can hold."""
+        return {name: to_json(getattr(self, name)) for name in _PARTS}
+
+    @staticmethod
+    def from_json(table: Any) -> "Run":
+        """The inverse of `to_json`; raises InputError over another table."""
+        return Run(**parts_from_json(table, _PARTS))
+
+    @staticmethod
+    def load(folder: str | Path) -> "Run":
+        """Reads run.json; raises InputError when it is missing or wrong."""
+        path = user_path(folder) / "run.json"
+        table = read_json(path, "the folder of a training run")
+        try:
+            return Run.from_json(table)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from None
+
+    def require_same(self, other: "Run", what: str) -> None:
+        """Raises InputError that names the first setting in which the other run differs."""
+        free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.each")}
+        for name, mine, others in _settings(self, other):
+            if mine != others and name not in free:
+                raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
+
+    @usual_flags()
+    def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
+        """An estimator with random parameters, or a ResNet with a trunk of `weights`.
+
+        Raises InputError for weights of another trunk, or where the hazard field is to begin with any.
+        """
+        if self.preset.model == FIELD:
+            require(weights is None, "weights", self.preset.weights, '"none": the hazard field begins with random ones')
+            return travjax.models.hazard_field.create(self.preset.field, seed)
+        return travjax.models.trajectory_resnet.create(self.preset.trunk, self.preset.heads, seed, weights)
+
+    def source(
+        self, heights: np.ndarray, on_progress: Callable[[int], object] = lambda count: None
+    ) -> ImageSource | MapSource:
+        """Maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
+        scale = self.preset.elevation_scale
+        if self.preset.model == FIELD:
+            return MapSource.of(heights, self.robot, self.actions, self.grid, scale)
+        return ImageSource.of(heights, self.robot, self.actions, self.grid, scale, on_progress)
+
+    @usual_flags()
+    def graph(self) -> nnx.GraphDef:
+        """What is fixed of the estimator."""
+        return take_apart(nnx.eval_shape(self.create))[0]
+
+    @usual_flags()
+    def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
+        """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
+
+        def state():
+            variables = take_apart(self.create())[1]
+            if phase:
+                trained = {name: variables[name] for name in TRAINED[phase]}
+                variables |= {"optimizer": self.preset.training.optimizer(phase, 1).init(trained)}
+            return variables
+
+        shaped = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
+        return jax.tree.map(shaped, jax.eval_shape(state))
+
+
+def _settings(mine: Any, other: Any, prefix: str = ""):
+    for field in dataclasses.fields(mine):
+        name, ours, theirs = prefix + field.name, getattr(mine, field.name), getattr(other, field.name)
+        if dataclasses.is_dataclass(ours) and type(theirs) is type(ours):
+            yield from _settings(ours, theirs, f"{name}.")
+        else:
+            yield name, ours, theirs
+
+
+def has_checkpoints(folder: Path) -> bool:
+    """Whether training has begun in the folder: it holds a checkpoint, whole or not."""
+    checkpoints = folder / "checkpoints"
+    return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
+
+
+def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict:
+    """Returns what training said of a checkpoint of a run.
+
+    Raises InputError that names the run's folder where it did not say it, and run.json where the checkpoint was trained
+    with other settings than those of `run`, if one is given; older checkpoints do not say with which.
+    """
+    where, told = f"{folder}: meta of a checkpoint", meta.get("position")
+    position = told if isinstance(told, dict) else {}
+    require(meta.get("optimizer") in (0, 1, 2), f"{where}: optimizer", meta.get("optimizer"), "0, 1 or 2")
+    require(isinstance(meta.get("dataset"), str), f"{where}: dataset", meta.get("dataset"), "a fingerprint")
+    counted = all(type(position.get(name)) is int and position[name] >= 0 for name in COUNTS)
+    summed = all(type(position.get(name)) in (int, float) and abs(position[name]) < math.inf for name in SUMS)
+    whole = counted and summed and position["phase"] in (1, 2) and len(position) == len(COUNTS + SUMS)
+    require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
+    if run and "run" in meta:
+        try:
+            trained = Run.from_json(meta["run"])
+        except InputError as error:
+            raise InputError(f"{where}: run: {error}") from None
+        trained.require_same(run, f"{user_path(folder) / 'run.json'}")
+    return meta
+
+
+@usual_flags()
+def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
+    """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
+
+    which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
+    Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or a
+    number of it is not finite.
+    """
+    run = Run.load(folder)
+    checkpoints = Checkpoints(user_path(folder) / "checkpoints")
+    state, meta = checkpoints.restore(lambda meta: run.template(checked_meta(meta, folder, run)["optimizer"]), which)
+    for notice in checkpoints.notices:
+        print(one_line(notice))
+    variables = {name: state[name] for name in VARIABLES}
+    for name, leaf in named_leaves(variables).items():
+        require_finite(f"{folder}, checkpoint {which}: {name}", np.asarray(leaf))
+    return run, put_together(run.graph(), state), meta
+
+
+def named_leaves(variables: Any) -> dict[str, Any]:
+    """The leaves of an estimator's variables by path, in their order: "trunk/trunk/stem/kernel"."""
+    name = lambda path: jax.tree_util.keystr(path, simple=True, separator="/").removesuffix("/value")
+    return {name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}

@@ -1,0 +1,100 @@
+"""Heights of maps as callers hand them over: checked, and as this package computes with them (SPEC section 1)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from travjax.config import InputError
+from travjax.simulation.arrays import are_numbers, numbers
+from travjax.simulation.grid import HIGHEST, MARKERS, Grid, require_grid
+
+COARSEST = 0.05
+"""Metres: heights of a two-byte type in larger steps are refused; bfloat16 has them from 8 m on, float16 from 64 m."""
+
+Heights = Float[Array, "*n rows cols"] | Float[np.ndarray, "*n rows cols"]
+
+
+def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool]:
+    """Returns checked float32 maps with a leading axis, and whether it was one map without that axis.
+
+    float64 heights are taken relative to each map's centre before they become float32. Masked and missing nodes are
+    unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or absurd ones, and
+    those that are a usual mark of unknown ground, are unknown.
+    Raises InputError when heights are not numbers in the grid's shape, and when those of any other array are infinite,
+    beyond 30 km, a usual mark of unknown ground (grid.MARKERS), or in steps larger than COARSEST.
+    """
+    require_grid(grid)
+    if not isinstance(heights, jax.Array):
+        heights = numbers("heights", heights, "numbers (metres)")
+    elif not are_numbers(heights.dtype):
+        raise InputError(f"heights: dtype {heights.dtype}: must be numbers (metres)")
+    if heights.ndim not in (2, 3) or heights.shape[-2:] != grid.shape:
+        allowed = f"[{grid.nodes}, {grid.nodes}] or [n, {grid.nodes}, {grid.nodes}]"
+        raise InputError(
+            f"heights: shape {list(heights.shape)}: must be {allowed}, a {grid.size:g} m map at {grid.spacing:g} m"
+        )
+    if heights.size == 0:
+        raise InputError("heights: zero maps: must be at least one")
+    maps = heights.reshape(-1, *grid.shape)
+    if isinstance(maps, np.ndarray):
+        _require_ground(maps)
+        require_close(maps)
+        if maps.dtype != np.float32:
+            maps = _relative(maps.astype(np.float64), grid)
+    elif maps.dtype == np.float64:
+        with jax.enable_x64(True):
+            maps = _relative(_unmarked(maps), grid).astype(jnp.float32)
+    else:
+        maps = _unmarked(maps)
+    return jnp.asarray(maps, jnp.float32), heights.ndim == 2
+
+
+@jax.jit
+def _unmarked(maps: jax.Array) -> jax.Array:
+    """Heights with NaN in place of the usual marks of unknown ground; on the device, nobody waits for it."""
+    heights = maps if maps.dtype == np.float64 else maps.astype(jnp.float32)
+    marked = heights == MARKERS[0]
+    for mark in MARKERS[1:]:
+        marked |= heights == mark
+    return jnp.where(marked, jnp.nan, heights)
+
+
+def require_close(maps: np.ndarray) -> None:
+    """Raises InputError for heights in a number type whose steps are coarse at that height: ground would be flat."""
+    if maps.dtype.kind in "iu" or maps.dtype.itemsize > 2:
+        return
+    values = np.abs(maps.astype(np.float32))
+    largest = np.max(values[values <= HIGHEST], initial=0)
+    step = float(np.exp2(np.floor(np.log2(max(largest, 1e-6)))) * jnp.finfo(maps.dtype).eps)
+    if step > COARSEST:
+        raise InputError(
+            f"heights = {largest:g}: is stored in steps of {step:g} m ({maps.dtype}): must be float32 or float64, or "
+            "relative to a height nearby"
+        )
+
+
+def _require_ground(maps: np.ndarray) -> None:
+    """Raises InputError for heights that cannot be, and for marks of unknown ground that are not declared as such."""
+    exact = maps.dtype.itemsize > 2 or maps.dtype.kind in "iu"
+    with np.errstate(over="ignore"):
+        marks = np.asarray(MARKERS, np.float64) if exact else np.asarray(MARKERS).astype(maps.dtype).astype(np.float64)
+    values = maps if maps.dtype == np.float32 else maps.astype(np.float64)
+    least = np.abs(marks).min()
+    if not (np.fmax.reduce(values, axis=None) >= least or np.fmin.reduce(values, axis=None) <= -least):
+        return
+    values = values[np.abs(values) >= least]
+    for bad in values[np.abs(values) > HIGHEST][:1]:
+        allowed = f"metres between {-HIGHEST:g} and {HIGHEST:g}, or NaN where unknown"
+        raise InputError(f"heights = {bad:g}: must be {allowed}")
+    for bad in values[np.isin(np.round(values, 6), marks)][:1]:
+        raise InputError(f"heights = {bad:g}: is a usual mark of unknown ground; must be metres, or NaN where unknown")
+
+
+def _relative(maps, grid: Grid):
+    """Heights [n, rows, cols] relative to that of each map's centre, where it is known."""
+    centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
+    use = jnp if isinstance(maps, jax.Array) else np
+    return maps - use.where(abs(centre) <= HIGHEST, centre, 0.0)

@@ -1,0 +1,333 @@
+"""The traverse simulator: every trajectory of a batch of maps in one pass (SPEC section 5).
+
+heights -> the four wheel contacts and the pose plane at each pose -> largest step, obstacle and tilt of each arc ->
+margins of all trajectories -> failures. First arcs are simulated once for all the second arcs that follow them.
+
+On the machine the maps of a batch and their views (footprint.py) lie side by side as the fastest axis, the "lanes", so
+that one table entry reads one row of memory, and a few first arcs at a time are simulated so that their poses stay in
+the cache. What was measured to arrive here is in BUILD_NOTES.md.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache, partial, reduce
+from itertools import pairwise
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, UInt8
+
+from travjax.batching import in_batches, rounded
+from travjax.config import require
+from travjax.jax_flags import usual_flags
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.footprint import RUN, Layout, View, chassis_places, node_table
+from travjax.simulation.grid import HIGHEST, Grid
+from travjax.simulation.heights import Heights, as_maps
+from travjax.simulation.robot import Robot
+
+EVENTS = ("step", "obstacle", "tilt")
+
+FEW_MAPS = 2
+"""Up to this many maps, RUN neighbouring nodes are read at once: the lanes alone would not fill a vector register."""
+
+CHUNK = 200_000
+"""Poses times lanes that a CPU simulates at once: a float32 array of them fits in the second-level cache of a core."""
+
+PLACES = 8
+"""Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
+
+UNKNOWN = 1e30
+"""Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["step", "obstacle", "tilt", "known"], meta_fields=[])
+@dataclass(frozen=True)
+class Margins:
+    """How far every trajectory goes towards each failure; NaN where unknown.
+
+    step:     [n, t] metres, largest change of a wheel's contact height between poses
+    obstacle: [n, t] metres, largest height of ground under the chassis above the pose plane
+    tilt:     [n, t] radians, largest slope of the pose plane
+    known:    [n, t] False where wheels or chassis touch unknown ground
+    """
+
+    step: Float[Array, "*n t"]
+    obstacle: Float[Array, "*n t"]
+    tilt: Float[Array, "*n t"]
+    known: Bool[Array, "*n t"]
+
+    def events(self) -> Float[Array, "*n t 3"]:
+        """The three margins in the order of EVENTS."""
+        return jnp.stack([self.step, self.obstacle, self.tilt], axis=-1)
+
+
+@lru_cache(maxsize=1)
+def default_robot() -> Robot:
+    """The Seekur Jr, the paper's robot."""
+    return Robot.load("seekur_jr")
+
+
+def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
+    """Whether these are the paper's, so that figures on synthetic maps compare with its own."""
+    return robot == default_robot() and actions == ActionSpace()
+
+
+def chosen_robot(robot: Robot | str | None) -> Robot:
+    """The robot that an argument names: the default one for None, else as `Robot.load` takes it."""
+    return default_robot() if robot is None else Robot.load(robot)
+
+
+def chosen_actions(actions: ActionSpace | None) -> ActionSpace:
+    """The action space that an argument gives: the paper's for None. Raises InputError for anything else."""
+    require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
+    return ActionSpace() if actions is None else actions
+
+
+@usual_flags()
+def simulate(
+    heights: Heights,
+    robot: Robot | str | None = None,
+    actions: ActionSpace | None = None,
+    *,
+    grid: Grid = Grid(),
+) -> Margins:
+    """Margins of every trajectory on every map.
+
+    heights: [n, rows, cols] or [rows, cols] metres, NaN or masked where unknown; laid out as in grid.py. Any array of
+             numbers, or lists of them; float64 heights are taken relative to the map's centre before they become
+             float32, so a site at 2000 m loses nothing
+    robot:   a Robot, or the name or file of one; the Seekur Jr unless given
+    actions: the paper's action space unless given
+    Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
+    Raises InputError when heights have another shape than the grid or are not numbers, when they are infinite, beyond
+    30 km or a usual mark of unknown ground such as -9999 (but for a jax array, which is not looked at: what is infinite
+    or beyond is unknown there), and when a trajectory leaves the map or turns inside the robot.
+    """
+    maps, alone = as_maps(heights, grid)
+    robot, actions = chosen_robot(robot), chosen_actions(actions)
+    layout = node_table(robot, actions, grid).layout
+
+    def simulate_batch(batch: jax.Array) -> Margins:
+        chunks, source = _device_tables(robot, actions, grid, len(batch))
+        return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout)
+
+    margins = in_batches(simulate_batch, maps)
+    return jax.tree.map(lambda margin: margin[0], margins) if alone else margins
+
+
+@usual_flags()
+def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
+    """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
+    return margins.events() > jnp.asarray(chosen_robot(robot).limits, jnp.float32)
+
+
+@usual_flags()
+def label(
+    heights: Heights,
+    robot: Robot | str | None = None,
+    actions: ActionSpace | None = None,
+    *,
+    grid: Grid = Grid(),
+) -> Bool[Array, "*n t 3"]:
+    """Failures (step, obstacle, tilt) of every trajectory on every map: [n, t, 3]; arguments and errors of `simulate`.
+
+    False where a trajectory is unknown as well: read it together with `simulate(...).known`.
+    """
+    return failures(simulate(heights, robot, actions, grid=grid), robot)
+
+
+@usual_flags()
+@jax.jit
+def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
+    """Labels in one byte a trajectory: bits 0 to 2 the failures in the order of EVENTS, bit 3 unknown."""
+    bits = jnp.concatenate([failed, ~known[..., None]], axis=-1)
+    return (bits << jnp.arange(4, dtype=jnp.int32)).sum(axis=-1).astype(jnp.uint8)
+
+
+@usual_flags()
+def unpacked(labels) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
+    """The (failed, known) that `packed` was given, from its labels: [n, t] uint8."""
+    bits = (jnp.asarray(labels)[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
+    return bits[..., :3].astype(bool), bits[..., 3] == 0
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["wheels", "centre", "offset", "axes", "runs", "singles"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class _Chunks:
+    """The pose arrays of a NodeTable cut into C chunks of A first arcs, laid out in the order in which they are read.
+
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, K / k, A P, 2, k] for k places in
+    one step of the kernel's scan.
+    """
+
+    wheels: jax.Array
+    centre: jax.Array
+    offset: jax.Array
+    axes: jax.Array
+    runs: jax.Array
+    singles: jax.Array
+
+
+@lru_cache(maxsize=8)
+def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
+    """The chunks for batches of `maps` and the `source` of a NodeTable, on the device."""
+    table = node_table(robot, actions, grid)
+    runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
+    arcs = len(table.centre)
+    if jax.default_backend() == "cpu":
+        arcs = min(arcs, max(1, round(CHUNK / (maps * len(table.layout.views) * table.layout.poses))))
+    padding = -len(table.centre) % arcs
+
+    def cut(array):
+        array = np.concatenate([array, array[:1].repeat(padding, axis=0)])
+        return array.reshape(len(array) // arcs, arcs * array.shape[1], *array.shape[2:])
+
+    with jax.ensure_compile_time_eval():  # arrays, and no tracers, when the caller is being traced
+        chunks = _Chunks(
+            wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
+            centre=jnp.asarray(cut(table.centre)),
+            offset=jnp.asarray(cut(table.offset)),
+            axes=jnp.asarray(cut(table.axes)),
+            runs=jnp.asarray(_scan_order(cut(runs))),
+            singles=jnp.asarray(_scan_order(cut(singles))),
+        )
+        return chunks, jnp.asarray(table.source)
+
+
+def _scan_order(places: np.ndarray) -> np.ndarray:
+    """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near PLACES."""
+    chunks, poses, _, count = places.shape
+    steps = -(-count // PLACES)
+    places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
+    each = places.shape[-1] // max(steps, 1)
+    return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
+
+
+@partial(jax.jit, static_argnames="layout")
+def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -> Margins:
+    grid = layout.grid
+    centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
+    heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN)
+    # Without these barriers XLA computes both anew for every element that is gathered from them.
+    by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)
+    views = jax.lax.optimization_barrier(_view_lanes(by_node, layout.views, grid))
+
+    def simulate_chunk(chunk: _Chunks) -> jax.Array:
+        contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
+        plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
+        obstacle = _highest_above(views, plane, chunk, grid.nodes)
+        return _arc_maxima(contact, plane.slope, obstacle, layout)
+
+    maxima = jax.lax.map(simulate_chunk, chunks).transpose(1, 0, 2, 3, 4).reshape(4, -1, len(maps))
+    step, slope, obstacle, contact = maxima[:, source].transpose(0, 2, 1)
+    known = (contact < UNKNOWN / 2) & (obstacle < UNKNOWN / 2)
+    tilt = jnp.arctan(jnp.sqrt(slope))
+    step, obstacle, tilt = (jnp.where(known, margin, jnp.nan) for margin in (step, obstacle, tilt))
+    return Margins(step, obstacle, tilt, known)
+
+
+def _view_lanes(by_node: jax.Array, views: tuple[View, ...], grid: Grid) -> jax.Array:
+    """[nodes, V n]: the map and its turned and mirrored images side by side."""
+    image = by_node.reshape(*grid.shape, -1)
+    return jnp.concatenate([jnp.flip(image, view.flipped) for view in views], axis=-1).reshape(len(by_node), -1)
+
+
+def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
+    """Contact heights of the wheels: [4, P, V n]."""
+    heights = by_node.at[wheels].get(mode="promise_in_bounds")
+    return heights.reshape(*heights.shape[:2], -1)
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [P, lanes] each.
+
+    slope: the square of the plane's slope.
+    """
+
+    level: jax.Array
+    east: jax.Array
+    north: jax.Array
+    slope: jax.Array
+
+
+def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
+    """The least-squares planes through the four contacts.
+
+    Each sum is joined with one product at most, however the loop is compiled: a map has the same bits in any batch.
+    """
+    front_left, front_right, rear_left, rear_right = contact
+    pitch = ((front_left + front_right) - (rear_left + rear_right)) * (0.5 / wheelbase)
+    roll = ((front_right + rear_right) - (front_left + rear_left)) * (0.5 / track)
+    cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
+    east = (roll * cos - rounded(pitch * sin)) * spacing
+    north = (roll * sin + rounded(pitch * cos)) * spacing
+    slope = pitch * pitch + rounded(roll * roll)
+    east, north, slope = jax.lax.optimization_barrier((east, north, slope))
+    middle = (front_left + front_right + rear_left + rear_right) / 4
+    level = middle - rounded(east * chunk.offset[:, :1]) - north * chunk.offset[:, 1:]
+    return _Planes(jax.lax.optimization_barrier(level), east, north, slope)
+
+
+def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
+    """Largest height of a chassis node above the pose plane: [P, lanes]."""
+    highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
+    if not len(chunk.runs):
+        return highest
+    in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, RUN, cols)
+    return reduce(_larger, jnp.split(in_runs, RUN, axis=1), highest)
+
+
+def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
+    """Largest height above the pose plane over the places, for each of the `run` nodes of a place: [P, run * lanes]."""
+    nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
+    aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
+    level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
+
+    def step(highest, group):
+        for k in range(group.shape[-1]):
+            row, col = group[:, 0, k], group[:, 1, k]
+            height = nodes.at[centre + row.astype(jnp.int32) * cols + col].get(mode="promise_in_bounds")
+            columns = col.astype(jnp.float32)[:, None] + aside
+            above = height - (level + east * columns + north * row.astype(jnp.float32)[:, None])
+            highest = _larger(above, highest)
+        return highest, None
+
+    return jax.lax.scan(step, jnp.full_like(level, -UNKNOWN), places)[0]
+
+
+def _arc_maxima(contact: jax.Array, slope: jax.Array, obstacle: jax.Array, layout: Layout) -> jax.Array:
+    """Maxima of (step, slope, obstacle, contact) over the poses of each of A first arcs and R second arcs.
+
+    Returns [4, A, R, lanes].
+    """
+
+    def poses(field):
+        """One array for each pose along the arcs: [..., A, 1, lanes] on the first, [..., A, R, lanes] on the second."""
+        field = field.reshape(*field.shape[:-2], -1, layout.poses, field.shape[-1])
+        first, second = field[..., : layout.first_poses, :], field[..., layout.first_poses :, :]
+        second = second.reshape(*second.shape[:-2], layout.second_arcs, -1, second.shape[-1])
+        along_first = [first[..., pose : pose + 1, :] for pose in range(first.shape[-2])]
+        return along_first, [second[..., pose, :] for pose in range(second.shape[-2])]
+
+    change = lambda along: [jnp.abs(b - a) for a, b in pairwise(along)]
+    wheels = [poses(field) for field in contact]
+    slopes, obstacles = poses(slope), poses(obstacle)
+    steps = [(change(first), change([first[-1], *second])) for first, second in wheels]
+    maxima = []
+    for part in (0, 1):
+        along = lambda fields: reduce(_larger, fields[part])  # noqa: B023
+        step, contact = (reduce(_larger, map(along, fields)) for fields in (steps, wheels))
+        # The barrier keeps XLA from computing the maxima of a first arc anew for each second arc.
+        maxima.append(jax.lax.optimization_barrier(jnp.stack([step, along(slopes), along(obstacles), contact])))
+    return _larger(*maxima)
+
+
+def _larger(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Maximum of numbers: one instruction, where jnp.maximum also looks for NaN."""
+    return jnp.where(a > b, a, b)

@@ -1,0 +1,146 @@
+"""Evaluation of a trained estimator on the test maps of a data set (SPEC section 10)."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from travjax.config import require
+from travjax.data import map_batches
+from travjax.data.dataset import Dataset, require_same
+from travjax.data.sampling import Samples, balanced_subset, every_sample, natural_sample
+from travjax.devices import Devices
+from travjax.evaluation import metrics
+from travjax.evaluation.baselines import LogisticRegression, slope_and_step
+from travjax.models.hazard_field import HazardField
+from travjax.models.input_images import ImageSource
+from travjax.models.trajectory_resnet import take_apart
+from travjax.runs.inference import hazards, logits_of, probabilities
+from travjax.runs.map_samples import MapSource
+from travjax.runs.run import Network, Run
+from travjax.simulation.traverse import as_in_paper, simulate, unpacked
+from travjax.training.step import LARGE_MARGIN
+
+Progress = Callable[[int], object]
+
+SPARSEST = 6
+"""A figure shows every sixth trajectory at least."""
+
+REGRESSION_SAMPLES = 50_000
+"""Training samples that the logistic regression is fitted to, at most."""
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """A run's data set on the devices, ready for its estimators.
+
+    Raises InputError when the data set is not for the run's robot, action space and grid, or when the devices cannot
+    share a batch.
+    """
+
+    run: Run
+    dataset: Dataset
+    source: ImageSource | MapSource
+    devices: Devices
+
+    @staticmethod
+    def of(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
+        """Puts the images' parts on the devices."""
+        require_same(dataset, run.robot, run.actions, run.grid)
+        devices.check_batch(run.preset.training.batch_size)
+        source = run.source(dataset.heights)
+        return Evaluator(run, dataset, devices.replicate(source), devices)
+
+    def samples(self, maps: int, each: int) -> Samples:
+        """Random test samples at natural frequency: of so many maps so many trajectories; 0 for all.
+
+        Raises InputError when there is none.
+        """
+        labels, test = self.dataset.labels, self.dataset.maps_of("test")
+        if maps or each:
+            seed = self.run.preset.training.seed
+            samples = natural_sample(labels, test, seed, maps or max(len(test), 1), each or labels.shape[1])
+        else:
+            samples = every_sample(labels, test)
+        require(len(samples[0]) > 0, "data set, test split", 0, "at least one known trajectory")
+        return samples
+
+    def failed(self, samples: Samples) -> np.ndarray:
+        """Failures of samples: [k, 3] bool."""
+        return np.asarray(unpacked(self.dataset.labels[samples])[0])
+
+    def probabilities(
+        self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
+    ) -> np.ndarray:
+        """Of samples: [k, 3]."""
+        graph, variables = take_apart(estimator)
+        variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
+        logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
+        return probabilities(logits)
+
+    def margins(
+        self, network: HazardField, samples: Samples, on_progress: Progress = lambda count: None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
+
+        Both are cut off where training does not tell them apart any more. on_progress: is told of maps
+        Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
+        """
+        graph, variables = take_apart(network)
+        maps, place = np.unique(samples[0], return_inverse=True)
+        source = cast(MapSource, self.source)
+        found = hazards(graph, self.devices.replicate(variables), source, maps, self.devices, on_progress)
+        run = self.run
+        simulated = simulate(self.dataset.heights[maps], run.robot, run.actions, grid=run.grid).events()
+        true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
+        allowed = "known trajectories alone, as its labels say"
+        require(bool(np.isfinite(true).all()), "data set, margins", "NaN", allowed)
+        return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], 3:], true))  # type: ignore
+
+    def to_show(self, count: int, group: str | None = None) -> np.ndarray:
+        """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""
+        data = self.dataset
+        test = data.maps_of("test")
+        test = test if group is None else test[data.group[test] == group]
+        failed, known = map(np.asarray, unpacked(data.labels[test]))
+        return test[map_batches.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
+
+    def whole_maps(
+        self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None, every: int = 1
+    ) -> np.ndarray:
+        """Probabilities of all trajectories of maps [k], or of every so many: [k, t, 3]."""
+        trajectories = np.arange(0, len(self.run.actions), every)
+        samples = (np.repeat(maps, len(trajectories)), np.tile(trajectories, len(maps)))
+        return self.probabilities(estimator, samples, on_progress).reshape(len(maps), len(trajectories), -1)
+
+    def every(self, maps: int, samples: int) -> int:
+        """Every how many trajectories of so many maps to show, so that a figure takes no longer than `samples` do.
+
+        At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. The hazard field reads
+        all trajectories of a map at once: all are shown.
+        """
+        if isinstance(self.source, MapSource):
+            return 1
+        most = min(SPARSEST, -(-maps * len(self.run.actions) // samples))
+        return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)
+
+    def regression(self, samples: Samples) -> np.ndarray:
+        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""
+        config, run, heights = self.run.preset.training, self.run, self.dataset.heights
+        maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.each)]
+        known = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
+        features = [slope_and_step(heights, part, run.actions, run.grid) for part in (known, samples)]
+        return LogisticRegression.fit(features[0], self.failed(known)).probabilities(features[1])
+
+    @property
+    def paper(self) -> Mapping[str, metrics.Confusion] | None:
+        """The paper's confusion matrices, if they compare: synthetic maps, its robot and its action space."""
+        compares = self.dataset.config and as_in_paper(self.run.robot, self.run.actions)
+        return metrics.PAPER_SYNTHETIC if compares else None
+
+    def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
+        """All figures of predicted probabilities [k, 3], by style or site as well."""
+        groups = self.dataset.group[samples[0]]
+        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls, paper=self.paper)

@@ -1,0 +1,344 @@
+"""Training in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
+
+All that is random follows from the training seed and the step, so a run that was interrupted goes on as if it had not
+been. What a step does is in step.py, on which samples in trajectory_samples.py.
+"""
+
+import itertools
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import nullcontext, suppress
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import optax
+
+from travjax import progress
+from travjax.config import InputError, one_line, require
+from travjax.data.dataset import Dataset, require_same
+from travjax.data.sampling import Samples
+from travjax.devices import Devices
+from travjax.evaluation import metrics
+from travjax.files import held
+from travjax.jax_flags import usual_flags
+from travjax.models.input_images import ImageSource
+from travjax.models.trajectory_resnet import VARIABLES, take_apart
+from travjax.runs.checkpoint import Checkpoints
+from travjax.runs.inference import NoNumbers, feature_logits, features_of, logits_of, probabilities
+from travjax.runs.map_samples import MapSource
+from travjax.runs.run import TRAINED, Network, Run, checked_meta
+from travjax.runs.run_log import RunLog
+from travjax.training.step import State, is_finite, update
+from travjax.training.trajectory_samples import TrainingData
+
+IN_FLIGHT = 2
+"""Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
+
+REPORTS = 20
+"""Rows of the training loss in an epoch."""
+
+
+@dataclass
+class Position:
+    """Where training stands; with the state, all that is needed to go on.
+
+    phase: 1 or 2; epoch: of the phase; step: of the epoch; total: steps in all
+    loss, samples: sums over the epoch so far; best: largest overall average precision of a validation so far
+    """
+
+    phase: int = 1
+    epoch: int = 0
+    step: int = 0
+    total: int = 0
+    loss: float = 0.0
+    samples: float = 0.0
+    best: float = -1.0
+
+
+class Trainer:
+    """One training run.
+
+    data: what is trained on; state: that of step.py; position: where it stands
+    watched: named samples on which each epoch is scored beside the validation, and the first state; training does not
+        depend on them
+    Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
+    validation samples, or when the devices cannot share a batch.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        dataset: Dataset,
+        folder: Path,
+        devices: Devices,
+        quiet: bool = False,
+        watched: Mapping[str, Samples] | None = None,
+    ):
+        require_same(dataset, run.robot, run.actions, run.grid)
+        devices.check_batch(run.preset.training.batch_size)
+        self.run, self.folder, self.devices = run, folder, devices
+        self.config = run.preset.training
+        self.data = self._data(dataset)
+        self.quiet = quiet or not devices.main
+        self.scored = {"validation": self.data.validation} | dict(watched or {})
+        self.checkpoints = Checkpoints(folder / "checkpoints")
+        self.position = Position()
+        self._optimizers: dict[int, optax.GradientTransformation] = {}
+        self.graph = run.graph()
+        self.log: RunLog | None = None
+
+    def _data(self, dataset: Dataset) -> TrainingData:
+        return TrainingData(dataset, self.config)
+
+    @cached_property
+    def source(self) -> ImageSource | MapSource:
+        """Images of all samples, or all maps, on the devices."""
+        with self._bar("trajectory bank", len(self.run.actions), "trajectory") as bar:
+            source = self.run.source(self.data.dataset.heights, bar.update)
+        return self.devices.replicate(source)
+
+    @cached_property
+    def features(self) -> dict[str, np.ndarray]:
+        """The frozen trunk's features of the samples of phase 1, computed once; those of a run of the same trunk and
+        samples may be set instead."""
+        samples = {"training": self.data.samples(1, 0)} | self.scored
+        return {name: self._over(features_of, part, f"{name} features") for name, part in samples.items()}
+
+    @usual_flags()
+    def start(self, estimator: Network) -> None:
+        """Begins with an estimator, whose trunk phase 1 leaves as it is."""
+        variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
+        self.state: State = self.devices.replicate(variables)
+        self._begin(1 if self.config.head_epochs else 2)
+
+    @usual_flags()
+    def resume(self) -> None:
+        """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
+
+        Raises InputError when there is none, or it was trained on another data set.
+        """
+        optimizer = lambda meta: checked_meta(meta, self.folder)["optimizer"]
+        template = lambda meta: self.run.template(optimizer(meta), self.devices.everywhere)
+        self.state, meta = self.checkpoints.restore(template)
+        trained_on, given = meta["dataset"], self.data.dataset.fingerprint
+        require(trained_on == given, "data set", given, f"{trained_on}, the one that the run was trained on so far")
+        self.position = Position(**meta["position"])
+        for notice in self.checkpoints.notices:
+            self._say(one_line(notice))
+        here = self.position
+        self._say(f"goes on from step {here.total}: phase {here.phase}, epoch {here.epoch + 1}, batch {here.step + 1}")
+
+    @usual_flags()
+    def train(self) -> None:
+        """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
+
+        Raises InputError when another process works in the folder, and when the loss is no number any more; the last
+        checkpoint is kept.
+        """
+        with held(self.folder) if self.devices.main else nullcontext():
+            self._train()
+
+    def _train(self) -> None:
+        if self.devices.main:
+            self.log = RunLog(self.folder, self.position.total)
+        try:
+            if not self.position.total and (row := self._watched()) and self.log:
+                self.log.write({"step": 0, "phase": self.position.phase, "epoch": 0} | row)
+            while self.position.phase == 1:
+                if self.position.epoch == self.config.head_epochs:
+                    self.checkpoints.save_named("heads", self._variables, self._meta(optimizer=0))
+                    self._begin(2)
+                else:
+                    self._train_epoch()
+            while self.position.epoch < self.config.epochs:
+                self._train_epoch()
+        finally:
+            if self.log:
+                self.log.close()
+
+    def _begin(self, phase: int) -> None:
+        """A new optimizer, for what the phase trains."""
+        self.__dict__.pop("features", None)  # gigabytes for a large data set
+        self.position.phase, self.position.epoch = phase, 0
+        trained = {name: self.state[name] for name in TRAINED[phase]}
+        optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
+        self.state = self._variables | {"optimizer": optimizer}
+
+    @property
+    def _variables(self) -> State:
+        """The state without its optimizer."""
+        return {name: self.state[name] for name in VARIABLES}
+
+    def _planned_steps(self, phase: int) -> int:
+        """Steps of a phase; with fresh samples an epoch may have one more or less."""
+        return self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
+
+    def _optimizer(self, phase: int) -> optax.GradientTransformation:
+        if phase not in self._optimizers:  # the same object each time: jit compiles for it
+            self._optimizers[phase] = self.config.optimizer(phase, self._planned_steps(phase))
+        return self._optimizers[phase]
+
+    def _train_epoch(self) -> None:
+        """From the present step to the end of the epoch, its validation and its checkpoint."""
+        here, data = self.position, self.data
+        steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
+        began = time.perf_counter()
+        running: deque[tuple[jax.Array, float]] = deque()
+        with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=int(done)) as bar:
+            for inputs, failed, weight in self._batches():
+                running.append((self._step(inputs, failed, weight), float(weight.sum())))
+                here.step, here.total = here.step + 1, here.total + 1
+                saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
+                while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
+                    self._count(*running.popleft(), here.step - len(running), bar)
+                if not running and not is_finite(self.state):
+                    raise self._diverged("a parameter that is no number", here.step)
+                if here.samples and here.step % max(steps // REPORTS, 1) == 0 and here.step < steps:
+                    rate = (here.samples - done) / (time.perf_counter() - began)
+                    self._report({"loss": here.loss / here.samples, "samples_per_s": rate})
+                if saves:
+                    self.checkpoints.save(here.total, self.state, self._meta(here.phase))
+        self._finish_epoch((here.samples - done) / (time.perf_counter() - began))
+
+    def _batches(self) -> Iterator[tuple[Any, Any, np.ndarray]]:
+        """What the steps of this epoch take, from the present one on."""
+        here, inputs_of = self.position, self._inputs()
+        for places, failed, weight in itertools.islice(self.data.batches(here.phase, here.epoch), here.step, None):
+            yield inputs_of(places), failed, weight
+
+    def _inputs(self) -> Callable[[np.ndarray], Any]:
+        """What a step of this epoch takes, from the places of its samples; features are computed if need be."""
+        here = self.position
+        if here.phase == 1:
+            features = self.features["training"]
+            return lambda places: features[places]
+        maps, trajectories = self.data.samples(here.phase, here.epoch)
+        return lambda places: (maps[places], trajectories[places])
+
+    def _step(self, inputs, failed, weight) -> jax.Array:
+        phase = self.position.phase
+        inputs, failed, weight = self.devices.shard((inputs, failed, weight))
+        self.state, loss = update(
+            self.state,
+            inputs if phase == 1 else (self.source, *inputs),
+            failed,
+            weight,
+            self.config.seed,
+            self.position.total,
+            graph=self.graph,
+            phase=phase,
+            optimizer=self._optimizer(phase),
+            penalty=self.config.penalty,
+        )
+        return loss
+
+    def _count(self, loss: jax.Array, samples: float, number: int, bar: progress.Bar) -> None:
+        """Adds a batch to the epoch's sums."""
+        here, value = self.position, float(loss)
+        if not math.isfinite(value):
+            raise self._diverged(f"loss = {value}", number)
+        here.loss, here.samples = here.loss + value * samples, here.samples + samples
+        bar.set_postfix(loss=f"{here.loss / here.samples:.3f}", refresh=False)
+        bar.update(int(samples))
+
+    def _diverged(self, what: str, number: int) -> InputError:
+        where = f"batch {number} of phase {self.position.phase}, epoch {self.position.epoch + 1}"
+        return InputError(
+            f"{what} in {where}: training stopped; the last checkpoint is kept, try a lower learning_rate"
+        )
+
+    def _finish_epoch(self, rate: float) -> None:
+        here = self.position
+        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated(), **self._watched()}
+        overall = row["average_precision"]["overall"] or 0.0
+        best, here.best = overall > here.best, max(here.best, overall)
+        self._report(row)
+        self._say(_summary(here, row, best))
+        here.epoch, here.step, here.loss, here.samples = here.epoch + 1, 0, 0.0, 0.0
+        self.checkpoints.save(here.total, self.state, self._meta(here.phase) | {"validation": row}, best)
+
+    def _validated(self) -> dict[str, Any]:
+        """Loss, that of the best constant predictor, average precision and F1 on the validation samples."""
+        logits = self._logits("validation")
+        failed = self.data.failed(self.data.validation)
+        share = failed.mean(axis=0, dtype=np.float64)
+        constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
+        scores = metrics.evaluate(probabilities(logits), failed.astype(bool))
+        return {
+            "validation_loss": float(optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1).mean()),
+            "constant_loss": constant,
+            "average_precision": metrics.to_json(scores.average_precision),
+            "f1": metrics.to_json(scores.f1),
+        }
+
+    def _watched(self) -> dict[str, Any]:
+        """Confusion and average precision of each event, and overall, on the watched samples."""
+        names = [name for name in self.scored if name != "validation"]
+        failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
+        scores = {name: metrics.evaluate(probabilities(self._logits(name)), failed[name]).scores for name in names}
+        return {"watched": metrics.to_json(scores)} if names else {}
+
+    def _logits(self, name: str) -> np.ndarray:
+        """Of the samples of that name, by the present state: [k, 3]."""
+        if self.position.phase == 1:
+            features = self.devices.replicate(self.features[name])
+            logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
+            if np.isfinite(logits).all():
+                return logits
+        else:
+            with suppress(NoNumbers):
+                return self._over(logits_of, self.scored[name], name)
+        raise self._diverged(f"a {name} logit that is no number", self.position.step)
+
+    def summary(self) -> str:
+        """One line: what is trained on what."""
+        run, device = self.run, jax.devices()[0].device_kind
+        return (
+            f"{run.robot.name}, {len(run.actions)} trajectories a map; {self.data.summary()}; first weights: "
+            f"{run.preset.weights}; devices: {self.devices.mesh.size} x {device}"
+        )
+
+    def _over(self, function, samples: Samples, what: str) -> np.ndarray:
+        variables = self._variables
+        with self._bar(what, len(samples[0])) as bar:
+            size = self.config.batch_size
+            return function(self.graph, variables, self.source, samples, self.devices, size, bar.update)
+
+    def _meta(self, optimizer: int) -> dict[str, Any]:
+        """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
+        return {
+            "position": asdict(self.position),
+            "optimizer": optimizer,
+            "dataset": self.data.dataset.fingerprint,
+            "run": self.run.to_json(),
+        }
+
+    def _report(self, row: dict[str, Any]) -> None:
+        here = self.position
+        schedule = self.config.schedule_of(here.phase, self._planned_steps(here.phase))
+        rate = float(schedule(here.epoch * self.data.steps(here.phase) + here.step - 1))  # of the step before
+        place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
+        if self.log:
+            self.log.write(place | row)
+
+    def _bar(self, what: str, total: int, unit: str = "sample", initial: int = 0) -> progress.Bar:
+        return progress.bar(what, total, unit, self.quiet, initial=initial, leave=False)
+
+    def _say(self, text: str) -> None:
+        if not self.quiet:
+            progress.say(text)
+
+
+def _summary(here: Position, row: dict[str, Any], best: bool) -> str:
+    shown = lambda value: "-" if value is None else f"{value:.3f}"
+    precision = ", ".join(f"{name} {shown(row['average_precision'][name])}" for name in metrics.NAMES)
+    losses = f"loss {row['loss']:.3f}, validation {row['validation_loss']:.3f} (constant {row['constant_loss']:.3f})"
+    rate = f"{row['samples_per_s']:.0f} samples/s"
+    star = ", best so far" if best else ""
+    return f"phase {here.phase}, epoch {here.epoch + 1}: {losses}; average precision: {precision}; {rate}{star}"

@@ -1,0 +1,78 @@
+"""The samples of each epoch of a training run, and their batches; all NumPy on the host."""
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+
+from travjax.config import require
+from travjax.data.dataset import Dataset
+from travjax.data.sampling import Sampler, Samples, balanced_subset, batches, random_keys
+from travjax.runs.preset import TrainingConfig
+from travjax.simulation.traverse import unpacked
+
+
+class TrainingData:
+    """Samples of a data set's training and validation maps.
+
+    Raises InputError when there are none of either.
+    """
+
+    def __init__(self, dataset: Dataset, config: TrainingConfig):
+        self.dataset, self.config = dataset, config
+        maps = dataset.maps_of("train")
+        self._sampler = Sampler(dataset.labels, maps, config.drawn_by, config.each, config.failing, config.fresh)
+        self._kept: dict[int, Samples] = {}
+        for split, samples in (("train", self.samples(1, 0)), ("validation", self.validation)):
+            require(len(samples[0]) > 0, f"data set, {split} split", 0, "at least one known trajectory")
+
+    def samples(self, phase: int, epoch: int) -> Samples:
+        """Training samples of an epoch; phase 1 has the same ones in all."""
+        number = 0 if phase == 1 else epoch + 1
+        if number not in self._kept:
+            # Those that steps are counted by stay; others are forgotten, a draw of a large data set takes a second.
+            counted = {kept: samples for kept, samples in self._kept.items() if kept < 2}
+            self._kept = counted | {number: self._sampler.epoch(number)}
+        return self._kept[number]
+
+    @cached_property
+    def validation(self) -> Samples:
+        """The balanced subset of the validation maps, or as many of it as the configuration allows."""
+        config, maps = self.config, self.dataset.maps_of("validation")
+        samples = balanced_subset(self.dataset.labels, maps, config.drawn_by, config.each, config.failing)
+        keys = random_keys(("validation", config.drawn_by), np.arange(len(samples[0])))
+        chosen = np.sort(np.argsort(keys)[: config.validation_samples])
+        return samples[0][chosen], samples[1][chosen]
+
+    def failed(self, samples: Samples) -> np.ndarray:
+        """Failures of samples: [k, 3] float32."""
+        return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
+
+    def count(self, phase: int, epoch: int) -> int:
+        """Samples of an epoch."""
+        return len(self.samples(phase, epoch)[0])
+
+    def steps(self, phase: int, epoch: int = 0) -> int:
+        """Batches of an epoch."""
+        return -(-self.count(phase, epoch) // self.config.batch_size)
+
+    def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Places in `samples` [b], failures [b, 3] and weights [b] of each step, in an order of the epoch's own.
+
+        The samples that fill up the last batch have weight 0, but count in its batch statistics.
+        """
+        samples = self.samples(phase, epoch)
+        failed, places = self.failed(samples), np.arange(len(samples[0]))
+        stream = 2 * epoch + phase - 1
+        chosen, _, weights = batches((places, places), self.config.batch_size, self.config.seed, stream)
+        for index, weight in zip(chosen, weights, strict=True):
+            yield index, failed[index], weight
+
+    def summary(self) -> str:
+        """What is trained on, for people."""
+        samples = self.samples(2, 0)
+        share = self.failed(samples).any(axis=1).mean()
+        return (
+            f"{len(self.dataset.maps_of('train'))} training maps; {len(samples[0])} samples an epoch, {share:.0%} of "
+            f"which fail; {len(self.validation[0])} validation samples"
+        )
