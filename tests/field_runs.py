@@ -12,7 +12,7 @@ from tests.small_training import GRID, HUSKY, dataset
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.devices import Devices
 from travjax.models.hazard_field import FieldConfig, HazardField, create
-from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
 from travjax.runs.run import Run
 from travjax.training.map_training import FieldTrainer
@@ -47,7 +47,7 @@ RUN = Run(PRESET, HUSKY, FEW, GRID)
 
 def random_variables(seed: int = 0):
     """What is fixed of a tiny estimator, and variables that are random where `create` has zeros and ones."""
-    graph, variables = take_apart(create(CONFIG, seed))
+    graph, variables = split_model(create(CONFIG, seed))
     rng = np.random.default_rng(seed)
     # Scales and variances have to be positive; kernels are random already.
     moved = lambda leaf: leaf + rng.uniform(0, 0.3, leaf.shape).astype(np.float32) if leaf.ndim == 1 else leaf
@@ -57,7 +57,7 @@ def random_variables(seed: int = 0):
 @functools.cache
 def estimator(seed: int = 0) -> HazardField:
     """A tiny one with random parameters and statistics, not to be changed."""
-    return put_together(*random_variables(seed))
+    return merge_model(*random_variables(seed))
 
 
 def trainer(folder: Path, run: Run = RUN, **training) -> FieldTrainer:

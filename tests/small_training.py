@@ -12,7 +12,7 @@ import numpy as np
 from tests.commandline import FEW, run_words
 from travjax.data.dataset import Dataset, DatasetConfig, generate, save
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import Estimator, HeadsConfig, create, put_together, take_apart
+from travjax.models.trajectory_resnet import Estimator, HeadsConfig, create, merge_model, split_model
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
@@ -100,20 +100,20 @@ def estimator(seed: int = 0) -> Estimator:
 @functools.partial(jax.jit, static_argnums=0)
 def forward(graph, variables, images):
     """Logits of images, in one piece of code: the same operations one by one take seconds to compile."""
-    return put_together(graph, variables)(images)
+    return merge_model(graph, variables)(images)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def features_of(graph, variables, images):
     """The trunk's features of images."""
-    return put_together(graph, variables).trunk(images)[0]
+    return merge_model(graph, variables).trunk(images)[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def in_training(graph, variables, images, key):
     """Logits of a forward pass with dropout and batch statistics, and the variables after it."""
-    made = put_together(graph, variables)
-    return made(images, train=True, key=key), take_apart(made)[1]
+    made = merge_model(graph, variables)
+    return made(images, train=True, key=key), split_model(made)[1]
 
 
 def run_of(**training) -> Run:

@@ -12,7 +12,7 @@ import pytest
 
 from travjax import files
 from travjax.config import InputError
-from travjax.files import find_data, folder_written_whole, held, output_folder, save_npz, written_whole
+from travjax.files import atomic_write, atomic_write_folder, find_data, held, output_folder, save_npz
 
 
 def listing(folder) -> set[str]:
@@ -21,7 +21,7 @@ def listing(folder) -> set[str]:
 
 def test_a_file_appears_when_the_block_ends(tmp_path):
     path = tmp_path / "a.txt"
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("new")
         assert not path.exists()
     assert path.read_text() == "new"
@@ -30,24 +30,24 @@ def test_a_file_appears_when_the_block_ends(tmp_path):
 
 def test_the_temporary_file_lies_in_a_hidden_folder_beside_the_final_one(tmp_path):
     # Only within one file system is it a rename, which happens at once.
-    with written_whole(tmp_path / "a.txt") as temporary:
+    with atomic_write(tmp_path / "a.txt") as temporary:
         assert temporary.name == "a.txt"
         assert temporary.parent.parent == tmp_path and temporary.parent.name.startswith(".travjax-unfinished-")
         temporary.touch()
-    with written_whole(tmp_path / ("n" * 255)) as temporary:
+    with atomic_write(tmp_path / ("n" * 255)) as temporary:
         temporary.touch()
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
 def test_a_failed_write_leaves_nothing(tmp_path, error):
-    with pytest.raises(error), written_whole(tmp_path / "a.txt") as temporary:
+    with pytest.raises(error), atomic_write(tmp_path / "a.txt") as temporary:
         temporary.write_text("half")
         raise error
     assert listing(tmp_path) == set()
 
 
 def test_a_failure_before_the_first_byte_is_passed_on(tmp_path):
-    with pytest.raises(RuntimeError), written_whole(tmp_path / "a.txt"):
+    with pytest.raises(RuntimeError), atomic_write(tmp_path / "a.txt"):
         raise RuntimeError
     assert listing(tmp_path) == set()
 
@@ -55,7 +55,7 @@ def test_a_failure_before_the_first_byte_is_passed_on(tmp_path):
 def test_a_failed_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with pytest.raises(RuntimeError), written_whole(path) as temporary:
+    with pytest.raises(RuntimeError), atomic_write(path) as temporary:
         temporary.write_text("half")
         raise RuntimeError
     assert path.read_text() == "old"
@@ -65,7 +65,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path):
 def test_an_old_file_is_there_until_the_new_one_replaces_it(tmp_path):
     path = tmp_path / "a.txt"
     path.write_text("old")
-    with path.open() as reader, written_whole(path) as temporary:
+    with path.open() as reader, atomic_write(path) as temporary:
         temporary.write_text("new")
         assert path.read_text() == "old"
         # A reader that has opened the old file goes on with it: the new one is another file under the same name.
@@ -185,9 +185,9 @@ def killed(folder: Path, script: str) -> None:
     assert done.returncode == -signal.SIGKILL
 
 
-FILE = "with files.written_whole(Path('a.txt')) as temporary:\n    temporary.write_text('half')\n    KILL"
+FILE = "with files.atomic_write(Path('a.txt')) as temporary:\n    temporary.write_text('half')\n    KILL"
 FOLDER = """
-with files.folder_written_whole(Path('set'), lambda folder: True) as temporary:
+with files.atomic_write_folder(Path('set'), lambda folder: True) as temporary:
     (temporary / 'half').touch()
     KILL
 """
@@ -197,7 +197,7 @@ with files.folder_written_whole(Path('set'), lambda folder: True) as temporary:
 def test_the_next_process_removes_what_a_dead_one_was_writing(tmp_path, script):
     killed(tmp_path, script)
     assert len(listing(tmp_path)) == 1 and "a.txt" not in listing(tmp_path)
-    with written_whole(tmp_path / "b.txt") as temporary:
+    with atomic_write(tmp_path / "b.txt") as temporary:
         temporary.touch()
     assert listing(tmp_path) == {"b.txt"}
 
@@ -210,9 +210,9 @@ def test_an_output_folder_is_cleared_of_it_at_once(tmp_path):
 
 def test_what_a_live_process_is_writing_is_left_alone(tmp_path):
     # Also by a process of the same number, as all containers have.
-    with written_whole(tmp_path / "a.txt") as mine:
+    with atomic_write(tmp_path / "a.txt") as mine:
         mine.write_text("mine")
-        with written_whole(tmp_path / "a.txt") as other:
+        with atomic_write(tmp_path / "a.txt") as other:
             other.write_text("other")
         output_folder(tmp_path)
         other_process = "from travjax.files import output_folder; output_folder('.')"
@@ -233,7 +233,7 @@ def test_a_folder_of_the_user_is_no_remains(tmp_path):
 
 
 def folder_of(path: Path, text: str) -> Path:
-    with folder_written_whole(path, lambda folder: (folder / "it.txt").exists()) as temporary:
+    with atomic_write_folder(path, lambda folder: (folder / "it.txt").exists()) as temporary:
         (temporary / "it.txt").write_text(text)
     return path
 
@@ -265,7 +265,7 @@ def killed(self, place):
         KILL
     return rename(self, place)
 Path.rename = killed
-with files.folder_written_whole(Path('set'), lambda folder: True) as temporary:
+with files.atomic_write_folder(Path('set'), lambda folder: True) as temporary:
     (temporary / 'it.txt').write_text('new')
 """
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests import field_runs, training
+from tests import field_runs, small_training
 from travjax.jax_flags import key_of, usual_flags
 from travjax.models.input_images import render_inputs
 from travjax.runs.predictor import Predictor
@@ -95,10 +95,10 @@ def test_probabilities_of_the_estimator_that_comes_with_the_package_are_the_same
     equal((found.probability, found.margins), (wanted.probability, wanted.margins))
 
 
-@pytest.mark.parametrize("runs", [training, field_runs], ids=["resnet50", "field"])
+@pytest.mark.parametrize("runs", [small_training, field_runs], ids=["resnet50", "field"])
 def test_a_run_is_the_same_and_goes_on_from_checkpoints_of_other_flags(runs, tmp_path, shared_code):
     """First weights, order, dropout, corruption and optimizer of a run that began under flags and went on without."""
-    epochs = {"head_epochs": 1} if runs is training else {}
+    epochs = {"head_epochs": 1} if runs is small_training else {}
     through = runs.begun(tmp_path / "through", epochs=2, **epochs)
     through.train()
     with flags_set({name: value for name, value in FLAGS.items() if name != "jax_disable_jit"}):
@@ -106,11 +106,11 @@ def test_a_run_is_the_same_and_goes_on_from_checkpoints_of_other_flags(runs, tmp
     more = runs.trainer(tmp_path / "begun", epochs=2, **epochs)
     more.resume()
     more.train()
-    training.require_equal(training.host(more.state), training.host(through.state))
+    small_training.require_equal(small_training.host(more.state), small_training.host(through.state))
     with flags_set():
         again = runs.trainer(tmp_path / "through", epochs=2, **epochs)
         again.resume()
-    training.require_equal(training.host(again.state), training.host(through.state))
+    small_training.require_equal(small_training.host(again.state), small_training.host(through.state))
 
 
 def test_a_fresh_process_under_all_flags_gives_the_same_bits(few_maps, tmp_path):

@@ -17,7 +17,7 @@ from pathlib import Path
 from travjax import entry, files, signals
 signals.end_at_once()
 def work():
-    with signals.going_on("it goes on"), files.written_whole(Path("a.txt")) as temporary:
+    with signals.going_on("it goes on"), files.atomic_write(Path("a.txt")) as temporary:
         temporary.write_text("half")
         os.kill(os.getpid(), NUMBER)
         print("still here")

@@ -28,7 +28,7 @@ REPLACED = ".travjax-replaced"
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """A temporary path of the same name to write to; it becomes `path` when the block ends well, else it is removed.
 
     Raises InputError when it cannot be written: a full disk, a folder in the way.
@@ -40,7 +40,7 @@ def written_whole(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def folder_written_whole(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
+def atomic_write_folder(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
     """A temporary folder to write to; it becomes `folder` when the block ends well, else it is removed.
 
     At any moment the old or the new one is in its place, where the file system can exchange two names; elsewhere the
@@ -289,13 +289,13 @@ def cache_folder() -> Path | None:
 
 def save_text(path: Path, text: str) -> Path:
     """Writes a text file, whole or not at all; what UTF-8 has no letter for, as in names of files, is escaped."""
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
     return path
 
 
 def save_npz(path: Path, **arrays) -> Path:
     """Writes arrays to one .npz file, whole or not at all."""
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)
     return path

@@ -93,7 +93,7 @@ def test_the_paper_stands_beside_its_own_robot_and_actions_only(tmp_path, few):
 
 
 def test_the_heights_are_in_memory_once(tmp_path, few, monkeypatch):
-    monkeypatch.setattr(dataset, "CHUNK", 64)
+    monkeypatch.setattr(dataset, "MAPS_AT_ONCE", 64)
     tracemalloc.start()
     try:
         succeeds(tmp_path / "set", "dataset", "--maps", 640, "--actions", few)

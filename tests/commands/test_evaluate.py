@@ -14,7 +14,7 @@ from travjax.data.dataset import save
 from travjax.data.sampling import every_sample
 from travjax.evaluation import metrics
 from travjax.models.input_images import render_inputs
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import unpacked
@@ -37,7 +37,7 @@ def truth(trained) -> metrics.Evaluation:
     """The figures of a direct forward pass on images of all samples."""
     samples = every_sample(dataset().labels, dataset().maps_of("test"))
     images = render_inputs(dataset().heights, *samples, HUSKY, FEW, grid=GRID, elevation_scale=0.5)
-    logits = np.asarray(forward(*take_apart(load_estimator(trained, "latest")[1]), images))
+    logits = np.asarray(forward(*split_model(load_estimator(trained, "latest")[1]), images))
     failed = np.asarray(unpacked(dataset().labels[samples])[0])
     return metrics.evaluate(1 / (1 + np.exp(-logits)), failed, dataset().group[samples[0]], recalls=[0.5])
 

@@ -11,7 +11,7 @@ from tests.commandline import FEW, files, run_words
 from tests.field_runs import CONFIG, begun
 from tests.small_training import copy, dataset, host, require_equal
 from travjax.commands.export import card
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.model_file import read_model
 from travjax.runs.predictor import DEFAULT, WEIGHTS, Predictor
@@ -59,7 +59,7 @@ def test_the_file_holds_the_checkpoint_that_is_named(field, tmp_path, which):
     exported(field, to, "--checkpoint", which)
     (run, network, notes), (wanted, trained, meta) = read_model(to), load_estimator(field, which)
     assert run == wanted
-    require_equal(host(take_apart(network)[1]), host(take_apart(trained)[1]))
+    require_equal(host(split_model(network)[1]), host(split_model(trained)[1]))
     position = meta["position"]
     assert notes == {"dataset": dataset().fingerprint, "epoch": position["epoch"], "step": position["total"]}
     if which == "latest":
@@ -85,7 +85,7 @@ def test_the_card_says_what_it_was_trained_on(field, tmp_path):
     exported(field, tmp_path / "it.safetensors", "--checkpoint", "latest")
     said = (tmp_path / "it.md").read_text()
     assert said.startswith("# it.safetensors\n")
-    count = sum(leaf.size for leaf in jax.tree.leaves(take_apart(load_estimator(field)[1])[1]))
+    count = sum(leaf.size for leaf in jax.tree.leaves(split_model(load_estimator(field)[1])[1]))
     assert row(said, "estimator") == f"field, {count:,} parameters" and CONFIG.hidden == 8
     assert row(said, "robot").startswith("Husky A200; ")
     assert row(said, "maps") == f"4 x 4 m at 0.125 m, {len(FEW)} trajectories"
@@ -129,7 +129,7 @@ def test_a_resnet_is_exported_too(trained, tmp_path):
     exported(trained, tmp_path / "it.safetensors", "--checkpoint", "heads")
     run, network, notes = read_model(tmp_path / "it.safetensors")
     assert run.preset.model == "resnet50" and notes["step"] == 14
-    require_equal(host(take_apart(network)[1]), host(take_apart(load_estimator(trained, "heads")[1])[1]))
+    require_equal(host(split_model(network)[1]), host(split_model(load_estimator(trained, "heads")[1])[1]))
     said = (tmp_path / "it.md").read_text()
     assert row(said, "estimator").startswith("resnet50, ") and "Beside the simulator" not in said
 

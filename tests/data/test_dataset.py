@@ -15,10 +15,10 @@ from tests.conftest import SETTINGS
 from travjax.config import InputError
 from travjax.data import dataset as module
 from travjax.data import dataset_json
-from travjax.data.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, require_same
+from travjax.data.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, require_matching
 from travjax.data.dataset import save as save_dataset
 from travjax.data.provenance import PROVENANCE_ARRAYS, Provenance, Site, SiteRecord, SitesConfig
-from travjax.files import folder_written_whole
+from travjax.files import atomic_write_folder
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -90,7 +90,7 @@ def test_each_map_is_the_one_of_its_style_and_seed_with_its_labels(made):
 
 
 def test_the_same_arguments_give_the_same_data_set_whatever_the_chunks(made, monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 32)
+    monkeypatch.setattr(module, "MAPS_AT_ONCE", 32)
     added: list[int] = []
     again = generate(CONFIG, ROBOT, ACTIONS, GRID, added.append)
     assert_equal(again, made)
@@ -211,7 +211,7 @@ def test_bad_configurations_are_named(values, message):
 
 
 def test_the_same_robot_actions_and_grid_are_accepted(made):
-    require_same(made, Robot.load("husky_a200"), replace(ACTIONS), Grid(4, 0.125))
+    require_matching(made, Robot.load("husky_a200"), replace(ACTIONS), Grid(4, 0.125))
 
 
 @pytest.mark.parametrize(
@@ -230,7 +230,7 @@ def test_the_same_robot_actions_and_grid_are_accepted(made):
 )
 def test_another_robot_action_space_or_grid_is_refused_and_both_are_named(made, change, message):
     with pytest.raises(InputError) as raised:
-        require_same(made, **({"robot": ROBOT, "actions": ACTIONS, "grid": GRID} | change))
+        require_matching(made, **({"robot": ROBOT, "actions": ACTIONS, "grid": GRID} | change))
     assert str(raised.value) == message
 
 
@@ -238,7 +238,7 @@ def test_a_robot_that_differs_in_much_is_named_in_one_line(made):
     with pytest.raises(
         InputError, match="^robot of the data set: name = 'Husky A200'.*here: name = 'Seekur Jr'"
     ) as raised:
-        require_same(made, Robot.load("seekur_jr"), ACTIONS, GRID)
+        require_matching(made, Robot.load("seekur_jr"), ACTIONS, GRID)
     assert len(str(raised.value)) < 400 and "\n" not in str(raised.value)
 
 
@@ -426,7 +426,7 @@ def test_a_full_disk_leaves_nothing_half_written(made, tmp_path, monkeypatch, ol
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
 def test_an_interrupted_write_leaves_the_older_folder(tmp_path, error):
     a_folder(tmp_path / "set")
-    with pytest.raises(error), folder_written_whole(tmp_path / "set", lambda folder: True) as temporary:
+    with pytest.raises(error), atomic_write_folder(tmp_path / "set", lambda folder: True) as temporary:
         (temporary / "half").touch()
         raise error
     assert listing(tmp_path) == {"set"}
@@ -437,7 +437,7 @@ def test_an_older_folder_comes_back_when_the_new_one_cannot_take_its_place(tmp_p
     a_folder(tmp_path / "set")
     with (
         pytest.raises(InputError, match="set: cannot be written: "),
-        folder_written_whole(tmp_path / "set", lambda folder: True) as temporary,
+        atomic_write_folder(tmp_path / "set", lambda folder: True) as temporary,
     ):
         temporary.rmdir()
     assert listing(tmp_path) == {"set"}
@@ -614,7 +614,7 @@ def test_saving_copies_no_large_array_and_loading_copies_it_once(large, tmp_path
 
 
 def test_generating_allocates_the_arrays_once(monkeypatch):
-    monkeypatch.setattr(module, "CHUNK", 64)
+    monkeypatch.setattr(module, "MAPS_AT_ONCE", 64)
     config = DatasetConfig(maps=640)
     size = config.maps * (GRID.nodes**2 * 4 + len(ACTIONS))
     assert peak_of(lambda: generate(config, ROBOT, ACTIONS, GRID)) < 1.3 * size

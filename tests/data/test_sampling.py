@@ -98,7 +98,7 @@ def test_the_choice_of_a_map_depends_on_no_other_map(labels, choose):
 
 def test_the_choice_does_not_depend_on_the_chunks(labels, monkeypatch):
     whole = balanced_subset(labels, everywhere(labels), 5)
-    monkeypatch.setattr(sampling, "CHUNK", 7)
+    monkeypatch.setattr(sampling, "MAPS_AT_ONCE", 7)
     for one, other in zip(whole, balanced_subset(labels, everywhere(labels), 5), strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -157,14 +157,14 @@ def slow_fates(config: SitesConfig, dataset: Dataset) -> dict[tuple, str]:
     """What becomes of each window of each site by the rules one after the other, in loops."""
     cut = {site.group: load_dem(site.file, config.stride, grid=GRID) for site in config.site}
     systems = {name: windows.crs if windows.crs.startswith("EPSG") else name for name, windows in cut.items()}
-    fates: dict[tuple, str] = {}
+    assignments: dict[tuple, str] = {}
     wanted: dict[tuple, str] = {}
     for site in config.site:
         origins, heights = cut[site.group].origins, cut[site.group].heights
         for origin, window in zip(origins, heights, strict=True):
             key = (site.group, *origin.tolist())
             known = np.isnan(window).mean() <= config.max_unknown and any_known(window)
-            fates[key] = "" if known else "too_unknown"
+            assignments[key] = "" if known else "too_unknown"
             wanted[key] = site.split
             for split in ("validation", "test"):
                 strip = getattr(site, f"{split}_strip")
@@ -178,16 +178,16 @@ def slow_fates(config: SitesConfig, dataset: Dataset) -> dict[tuple, str]:
                     wanted[key] = split if beyond + SIZE <= strip[1] else wanted[key]
     touching = lambda key, split, reach: any(
         systems[key[0]] == systems[other[0]] and distance(key[1:], other[1:]) < reach
-        for other, fate in fates.items()
-        if fate == split
+        for other, assignment in assignments.items()
+        if assignment == split
     )
     for split, reach, left_out in (("test", 8.0, "near_test"), ("validation", CELL / 2, "shared")):
-        for key in fates:
-            if not fates[key] and wanted[key] == split:
-                fates[key] = split
-        near = [key for key, fate in fates.items() if not fate and touching(key, split, reach)]
-        fates |= dict.fromkeys(near, left_out)
-    return {key: fate or "train" for key, fate in fates.items()}
+        for key in assignments:
+            if not assignments[key] and wanted[key] == split:
+                assignments[key] = split
+        near = [key for key, assignment in assignments.items() if not assignment and touching(key, split, reach)]
+        assignments |= dict.fromkeys(near, left_out)
+    return {key: assignment or "train" for key, assignment in assignments.items()}
 
 
 def any_known(window: np.ndarray) -> bool:
@@ -198,7 +198,7 @@ def any_known(window: np.ndarray) -> bool:
 
 def test_each_window_is_where_the_rules_put_it(case):
     config, dataset = case
-    fates = slow_fates(config, dataset)
+    assignments = slow_fates(config, dataset)
     upright = np.flatnonzero(dataset.provenance.quarter_turns == 0)
     origins = dataset.provenance.origin[upright].tolist()
     found = {
@@ -208,17 +208,17 @@ def test_each_window_is_where_the_rules_put_it(case):
         )
     }
     assert len(found) == len(upright)
-    assert found == {key: fate for key, fate in fates.items() if fate in SPLITS}
+    assert found == {key: assignment for key, assignment in assignments.items() if assignment in SPLITS}
     for record in dataset.provenance.sites:
-        mine = [fate for key, fate in fates.items() if key[0] == record.name]
+        mine = [assignment for key, assignment in assignments.items() if key[0] == record.name]
         assert record.windows == len(mine)
-        for fate in (*SPLITS, "too_unknown", "near_test", "shared"):
-            assert getattr(record, fate) == mine.count(fate), fate
+        for assignment in (*SPLITS, "too_unknown", "near_test", "shared"):
+            assert getattr(record, assignment) == mine.count(assignment), assignment
 
 
 def test_every_fate_occurs(hill):
     record = hill[1].provenance.sites[0]
-    assert all(getattr(record, fate) for fate in (*SPLITS, "too_unknown", "near_test", "shared"))
+    assert all(getattr(record, assignment) for assignment in (*SPLITS, "too_unknown", "near_test", "shared"))
 
 
 def test_a_larger_gap_leaves_out_more(files, hill):
@@ -339,7 +339,7 @@ def test_the_data_set_is_read_back_as_it_was_saved(hill, tmp_path):
 
 
 def test_the_same_sites_give_the_same_data_set(files, hill, monkeypatch):
-    monkeypatch.setattr(sites, "CHUNK", 32)
+    monkeypatch.setattr(sites, "MAPS_AT_ONCE", 32)
     added: list[int] = []
     again = made(hill[0], on_progress=added.append)
     assert again.fingerprint == hill[1].fingerprint

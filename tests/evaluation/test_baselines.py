@@ -32,7 +32,7 @@ def slowly(heights: np.ndarray, trajectory: int) -> tuple[float, float]:
 
 
 def test_slope_and_step_are_those_of_a_slow_loop(monkeypatch):
-    monkeypatch.setattr(baselines, "CHUNK", 7)
+    monkeypatch.setattr(baselines, "SAMPLES_AT_ONCE", 7)
     data = dataset()
     samples = RANDOM.integers(0, 30, 40), RANDOM.integers(0, len(FEW), 40)
     wanted = [slowly(data.heights[index], trajectory) for index, trajectory in zip(*samples, strict=True)]

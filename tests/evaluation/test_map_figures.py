@@ -184,7 +184,7 @@ def paths(ax) -> dict[str, int]:
         map_figures.SAFE: "safe",
         map_figures.DOUBTFUL: "doubtful",
         map_figures.FAILED: "failed",
-        map_figures.UNKNOWN: "unknown",
+        map_figures.UNKNOWN_COLOUR: "unknown",
     }
     drawn = {}
     for lines in ax.collections:

@@ -288,7 +288,7 @@ def test_the_order_of_samples_does_not_matter():
     probabilities, failed = sample(**KINDS["many ties"])
     shuffle = np.random.default_rng(1).permutation(len(failed))
     one, other = (
-        metrics.to_json(evaluate(*pair))
+        metrics.json_ready(evaluate(*pair))
         for pair in ((probabilities, failed), (probabilities[shuffle], failed[shuffle]))
     )
     assert one.pop("calibration")["step"]["error"] == pytest.approx(other.pop("calibration")["step"]["error"])
@@ -316,7 +316,7 @@ def test_one_sample_is_enough(probabilities, failed):
         precision = found.average_precision[event]
         assert precision == 1 if failed[e] else math.isnan(precision)
     assert found.average_precision["mean"] == 1
-    json.dumps(metrics.to_json(found), allow_nan=False)
+    json.dumps(metrics.json_ready(found), allow_nan=False)
 
 
 def test_an_event_without_failures_is_nan_and_counts_in_no_mean():
@@ -369,7 +369,7 @@ def test_json_has_every_figure_and_null_where_undefined():
     probabilities, failed = sample(300)
     failed[:, 2] = False
     found = evaluate(probabilities, failed, ["a"] * 300)
-    read = json.loads(json.dumps(metrics.to_json(found), allow_nan=False))
+    read = json.loads(json.dumps(metrics.json_ready(found), allow_nan=False))
     step = read["scores"]["step"]["confusion"]
     counts = found.scores["step"].confusion
     assert step == {
@@ -386,6 +386,6 @@ def test_json_has_every_figure_and_null_where_undefined():
 
 
 def test_json_of_what_is_not_finite_is_null():
-    assert metrics.to_json({"a": [math.nan, math.inf, np.float32(1.5), np.int64(3), True, None, "b"]}) == {
+    assert metrics.json_ready({"a": [math.nan, math.inf, np.float32(1.5), np.int64(3), True, None, "b"]}) == {
         "a": [None, None, 1.5, 3, True, None, "b"]
     }

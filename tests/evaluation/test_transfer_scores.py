@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.small_training import loads
-from travjax.evaluation.metrics import NAMES, Confusion, to_json, with_overall
+from travjax.evaluation.metrics import NAMES, Confusion, json_ready, with_overall
 from travjax.evaluation.transfer_scores import ALL, Results, arms_table, events_table, mean_and_spread, results_json
 
 SAFE = Confusion(10, 0, 0, 0)
@@ -19,7 +19,7 @@ def row(epoch: int, validation: float | None, **sites: Confusion) -> dict:
     for site, counts in sites.items():
         confusions = with_overall({"step": SAFE, "obstacle": counts, "tilt": SAFE})
         scored[site] = {
-            name: {"confusion": to_json(one), "average_precision": None} for name, one in confusions.items()
+            name: {"confusion": json_ready(one), "average_precision": None} for name, one in confusions.items()
         }
     made = {"epoch": epoch, "watched": scored}
     return made if epoch == 0 else made | {"average_precision": {"overall": validation}}
@@ -42,7 +42,7 @@ def results(arm: str = "random") -> Results:
         row(1, 0.3, hill=counts(2, 1), plain=counts(0, 0, 1)),
         row(2, 0.7, hill=counts(1, 0), plain=counts(1, 0, 1)),
     ]
-    return Results.of({arm: {0: first, 1: second}})
+    return Results.from_rows({arm: {0: first, 1: second}})
 
 
 def test_f1_of_each_seed_and_epoch_pools_the_events():
@@ -56,7 +56,7 @@ def test_the_sites_together_add_their_counts():
     together = results().arms["random"][0].epochs[1].held_out[ALL]
     assert together["obstacle"] == counts(2, 2) + counts(0, 1, 1)
     assert together["overall"].samples == 60
-    one = Results.of({"random": {0: [row(0, None, hill=SAFE), row(1, 0.5, hill=SAFE)]}})
+    one = Results.from_rows({"random": {0: [row(0, None, hill=SAFE), row(1, 0.5, hill=SAFE)]}})
     assert one.sites == ["hill"]
 
 
@@ -69,7 +69,7 @@ def test_the_best_epoch_is_that_of_the_held_out_site_and_the_chosen_one_that_of_
 
 def test_the_first_state_is_never_the_best_epoch():
     falling = [row(0, None, hill=counts(4, 0)), row(1, None, hill=counts(1, 0)), row(2, None, hill=counts(0, 0))]
-    made = Results.of({"random": {0: falling}})
+    made = Results.from_rows({"random": {0: falling}})
     assert made.best("random", "hill")[0].number == made.chosen("random")[0].number == 1
 
 

@@ -17,7 +17,7 @@ from travjax.data.provenance import SitesConfig
 from travjax.evaluation import score_figures
 from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.experiments import comparison
-from travjax.experiments.robustness import CORRUPTIONS, FILTERS, Ground, of_sites
+from travjax.experiments.robustness import CORRUPTIONS, FILTERS, BenchmarkMaps, of_sites
 from travjax.experiments.robustness_scores import (
     FILTERED,
     HAZARD,
@@ -53,7 +53,7 @@ def model(tmp_path_factory):
 def sites(tmp_path_factory) -> Path:
     """Two sites, ridge of two windows and plain of one, as a TOML file."""
     folder = tmp_path_factory.mktemp("sites")
-    heights = Ground.synthetic(10, 5, HUSKY, FEW, GRID).heights
+    heights = BenchmarkMaps.synthetic(10, 5, HUSKY, FEW, GRID).heights
     ridge = np.concatenate([heights[8], heights[9][:, 1:]], axis=1)
     ridge[3:5, 40:50] = np.nan
     tables = ["stride = 4.0", "fill_holes = false"]
@@ -101,7 +101,7 @@ def test_everything_that_is_written_is_printed(done):
 def test_the_figures_are_those_of_the_methods(done):
     maps = json.loads((done[0] / "results.json").read_text())["maps"]
     assert list(maps) == list(CORRUPTIONS)
-    test = Ground.synthetic(6, comparison.SEED, HUSKY, FEW, GRID)
+    test = BenchmarkMaps.synthetic(6, comparison.SEED, HUSKY, FEW, GRID)
     for name in ("none", "noise 2 cm", "20% missing"):
         probability = Predictor(RUN, estimator()).predict(test.seen(name, comparison.SEED)).probability
         counts = maps[name]["methods"]["hazard field"]["confusion"]["overall"]
@@ -120,7 +120,7 @@ def test_the_figures_are_those_of_the_methods(done):
 
 def test_the_filter_is_the_best_on_validation_maps(done):
     maps = json.loads((done[0] / "results.json").read_text())["maps"]
-    validation = Ground.synthetic(5, comparison.SEED + 1, HUSKY, FEW, GRID)
+    validation = BenchmarkMaps.synthetic(5, comparison.SEED + 1, HUSKY, FEW, GRID)
     for name in CORRUPTIONS:
         seen = validation.seen(name, comparison.SEED + 1)
         f1 = {key: validation.scores(validation.simulated(of(seen)))[OVERALL].f1 for key, of in FILTERS.items()}
@@ -149,7 +149,7 @@ def test_another_seed_gives_other_maps_and_the_same_one_the_same_results():
     network = Predictor(RUN, estimator())
     found = []
     for seed in (1, 1, 2):
-        test, validation = (Ground.synthetic(5, seed + number, HUSKY, FEW, GRID) for number in (0, 1))
+        test, validation = (BenchmarkMaps.synthetic(5, seed + number, HUSKY, FEW, GRID) for number in (0, 1))
         found.append(compare(test, validation, network, None, 5, best_filters(validation, seed), seed))
     assert found[0] == found[1] != found[2]
 

@@ -12,7 +12,7 @@ from travjax.experiments.robustness import (
     CLEAN,
     CORRUPTIONS,
     FILTERS,
-    Ground,
+    BenchmarkMaps,
     average_precisions,
     by_margins,
     of_samples,
@@ -23,8 +23,8 @@ from travjax.simulation.traverse import simulate
 
 
 @pytest.fixture(scope="module")
-def ground() -> Ground:
-    return Ground.synthetic(10, 3, HUSKY, FEW, GRID)
+def ground() -> BenchmarkMaps:
+    return BenchmarkMaps.synthetic(10, 3, HUSKY, FEW, GRID)
 
 
 def test_the_ground_is_that_of_the_simulator(ground):
@@ -75,7 +75,7 @@ def test_samples_of_an_estimator_are_those_of_whole_maps(ground):
 def sites(tmp_path_factory) -> SitesConfig:
     """Windows of synthetic maps as sites: two of one map each with a hole, one of 3 x 2 windows."""
     folder = tmp_path_factory.mktemp("sites")
-    heights = Ground.synthetic(10, 5, HUSKY, FEW, GRID).heights
+    heights = BenchmarkMaps.synthetic(10, 5, HUSKY, FEW, GRID).heights
     small = heights[3].copy()
     small[20:24, 5:25] = np.nan
     large = np.concatenate([np.concatenate([heights[8], heights[9][:, 1:]], axis=1)] * 2)[: 48 + 1]

@@ -129,12 +129,12 @@ def test_frozen_trunks_stay_as_they_are_and_heads_begin_by_seed(frozen, trained)
 
 def test_the_first_state_of_the_synthetic_arm_is_the_untouched_synthetic_model(frozen):
     made, rows, _ = frozen
-    evaluator = Evaluator.of(made.base, made.dataset, made.devices)
+    evaluator = Evaluator.from_run(made.base, made.dataset, made.devices)
     for site, samples in made.held_out.items():
         counts = metrics.confusions(evaluator.probabilities(made.pretrained, samples), evaluator.failed(samples))
         for seed in FROZEN.seeds:
             first = rows[SYNTHETIC][seed][0]["watched"][site]
-            assert {name: scores["confusion"] for name, scores in first.items()} == metrics.to_json(counts)
+            assert {name: scores["confusion"] for name, scores in first.items()} == metrics.json_ready(counts)
 
 
 def test_a_finished_run_is_read_and_not_trained_again(frozen, trained, real, monkeypatch):
@@ -216,13 +216,13 @@ def test_without_frozen_trunks_everything_is_trained_and_random_trunks_differ_by
 
 def test_the_estimator_of_an_arm_is_that_of_the_epoch_that_is_best_on_validation(frozen):
     made, rows, _ = frozen
-    evaluator = Evaluator.of(made.base, made.dataset, made.devices)
+    evaluator = Evaluator.from_run(made.base, made.dataset, made.devices)
     (site, samples), *_ = made.held_out.items()
     best = max(rows[SYNTHETIC][1][1:], key=lambda row: row["average_precision"]["overall"])
     counts = metrics.confusions(
         evaluator.probabilities(made.estimator(SYNTHETIC, 1), samples), evaluator.failed(samples)
     )
-    assert best["watched"][site]["overall"]["confusion"] == metrics.to_json(counts["overall"])
+    assert best["watched"][site]["overall"]["confusion"] == metrics.json_ready(counts["overall"])
 
 
 # ---- Bad input
@@ -290,7 +290,7 @@ def test_the_hazard_field_begins_with_random_weights_and_with_the_synthetic_mode
     rows = run_all(made, lambda arm, seed: None)
     assert list(rows) == list(FIELD_ARMS)
     assert all([row["epoch"] for row in rows[arm][0]] == [0, 1] for arm in FIELD_ARMS)
-    evaluator = Evaluator.of(base, real, Devices.all())
+    evaluator = Evaluator.from_run(base, real, Devices.all())
     for site, samples in made.held_out.items():
         found = metrics.evaluate(evaluator.probabilities(made.pretrained, samples), evaluator.failed(samples))
         counts = rows["synthetic"][0][0]["watched"][site]["overall"]["confusion"]

@@ -23,7 +23,7 @@ from tests.resnet.test_imagenet_weights import NARROW, canonical_arrays, keras_a
 from travjax.data.dataset import Dataset, DatasetConfig, load, save
 from travjax.data.dem import load_dem
 from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
-from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.resnet.imagenet_weights import load_weights
 from travjax.runs.checkpoint import Checkpoints, load_meta
 from travjax.runs.model_file import read_model, write_model
@@ -274,7 +274,7 @@ def _variables():
 
 
 def _model(folder: Path) -> None:
-    network = put_together(RUN.graph(), _variables())
+    network = merge_model(RUN.graph(), _variables())
     write_model(folder / "it.safetensors", RUN, network, {"dataset": "0123", "step": 8})
 
 
@@ -292,7 +292,7 @@ def _read_checkpoint(folder: Path) -> None:
 
 
 def _require_finite(network) -> None:
-    for leaf in jax.tree.leaves(take_apart(network)[1]):
+    for leaf in jax.tree.leaves(split_model(network)[1]):
         _require(bool(np.isfinite(np.asarray(leaf, np.float32)).all()), "weights", "not finite")
 
 

@@ -14,7 +14,7 @@ from tests.small_training import GRID, HUSKY, dataset
 from travjax.config import InputError
 from travjax.models.hazard_field import FieldConfig, create, read_out
 from travjax.models.pose_stencil import Stencil, nodes_at, stencil
-from travjax.models.trajectory_resnet import put_together
+from travjax.models.trajectory_resnet import merge_model
 from travjax.runs.map_samples import MapSource, relative
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -44,7 +44,7 @@ def test_the_read_out_is_a_loop_over_the_poses_of_each_trajectory():
 def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
     """The whole network against the channels of its U-Net, read by hand at the poses of `actions.poses`."""
     made, heights = estimator(), dataset().heights[:2]
-    source = MapSource.of(heights, HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(heights, HUSKY, FEW, GRID, 0.1)
     elevation = source.elevation(np.arange(2))
     logits, margins = map(np.asarray, made(elevation, source.stencil))
     channels = np.asarray(made.trunk(elevation, False), np.float64).reshape(2, -1, CONFIG.channels)
@@ -69,7 +69,7 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
 
 
 def test_a_map_is_seen_the_same_in_any_batch():
-    source = MapSource.of(dataset().heights, HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights, HUSKY, FEW, GRID, 0.1)
     together = estimator()(source.elevation(np.arange(5)), source.stencil)
     for index in (0, 3):
         alone = estimator()(source.elevation(np.array([index])), source.stencil)
@@ -78,13 +78,13 @@ def test_a_map_is_seen_the_same_in_any_batch():
 
 
 def test_the_height_of_the_map_plays_no_part():
-    source, raised = (MapSource.of(dataset().heights[:1] + up, HUSKY, FEW, GRID, 0.1) for up in (0, 64))
+    source, raised = (MapSource.from_maps(dataset().heights[:1] + up, HUSKY, FEW, GRID, 0.1) for up in (0, 64))
     low, high = (estimator()(one.elevation(np.array([0])), one.stencil)[0] for one in (source, raised))
     np.testing.assert_allclose(low, high, atol=1e-3)
 
 
 def test_trajectories_of_a_few_first_arcs_are_those_of_all():
-    source = MapSource.of(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
     table, elevation = source.stencil, source.elevation(np.array([0]))
     whole = estimator()(elevation, table)[0].reshape(-1, table.second_arcs, 3)
     some = np.array([1, 4])
@@ -95,7 +95,7 @@ def test_trajectories_of_a_few_first_arcs_are_those_of_all():
 def test_an_unknown_node_is_seen_as_the_nearest_known_one():
     heights = dataset().heights[:1].copy()
     heights[0, 5, 7] = np.nan
-    seen = MapSource.of(heights, HUSKY, FEW, GRID, 0.1).heights
+    seen = MapSource.from_maps(heights, HUSKY, FEW, GRID, 0.1).heights
     assert np.isfinite(seen).all() and seen[0, 5, 7] in heights[0, 4:7, 6:9]
 
 
@@ -109,12 +109,12 @@ def test_maps_may_have_any_number_of_nodes(nodes):
 
 def test_gradients_reach_every_parameter():
     graph, variables = random_variables()
-    source = MapSource.of(dataset().heights[:3], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:3], HUSKY, FEW, GRID, 0.1)
     elevation = source.elevation(np.arange(3))
     weights = np.random.default_rng(0).normal(size=(2, 3, len(FEW), 3)).astype(np.float32)
 
     def total(parameters):
-        made = put_together(graph, variables | parameters)
+        made = merge_model(graph, variables | parameters)
         return sum(
             (part * w).sum() for part, w in zip(made(elevation, source.stencil, train=True), weights, strict=True)
         )
@@ -126,7 +126,7 @@ def test_gradients_reach_every_parameter():
 
 def test_activations_may_be_bfloat16():
     config = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, dtype="bfloat16")
-    source = MapSource.of(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
     found = [create(c)(source.elevation(np.array([0])), source.stencil)[0] for c in (config, CONFIG)]
     assert found[0].dtype == jnp.float32
     np.testing.assert_allclose(*found, atol=0.2)

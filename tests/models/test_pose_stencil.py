@@ -7,7 +7,7 @@ import pytest
 
 from tests.conftest import SETTINGS
 from travjax.config import InputError
-from travjax.models.pose_stencil import ALONG, PLACES, nodes_at, stencil
+from travjax.models.pose_stencil import ALONG, STENCIL_NODES, nodes_at, stencil
 from travjax.simulation.footprint import node_table
 
 
@@ -40,7 +40,7 @@ def test_stencils_are_the_nodes_nearest_to_their_places(setting):
         turn, first = divmod(int(arc), len(radii))
         second = int(rng.integers(len(radii)))
         own, rest = actions.first_poses(turn, first), actions.second_poses(turn, first, second)
-        following = table.nodes[arc, split:].reshape(len(radii), len(rest), PLACES)[second]
+        following = table.nodes[arc, split:].reshape(len(radii), len(rest), STENCIL_NODES)[second]
         for poses, nodes, radius in ((own, table.nodes[arc, :split], radii[first]), (rest, following, radii[second])):
             for pose, found in zip(poses, nodes, strict=True):
                 for place, node in zip(places_by_hand(pose, radius, robot, actions), found, strict=True):
@@ -53,7 +53,7 @@ def test_the_first_places_are_the_nodes_under_the_wheels_in_the_simulator(settin
     robot, actions, grid = setting
     table, simulated = stencil(robot, actions, grid), node_table(robot, actions, grid)
     turns, radii = actions.turns, len(actions.radii)
-    assert table.nodes.shape[1:] == (simulated.layout.poses, PLACES) and len(table.nodes) == turns * radii
+    assert table.nodes.shape[1:] == (simulated.layout.poses, STENCIL_NODES) and len(table.nodes) == turns * radii
     own = {tuple(wheels.ravel()) for wheels in table.nodes[..., :4]}
     assert {tuple(wheels.ravel()) for wheels in simulated.wheels[..., 0]} <= own
 

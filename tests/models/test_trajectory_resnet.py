@@ -9,7 +9,7 @@ from flax import nnx
 
 from tests.small_training import PRESET, differing, estimator, features_of, forward, host, in_training, require_equal
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import VARIABLES, HeadsConfig, create, put_together, take_apart
+from travjax.models.trajectory_resnet import VARIABLES, HeadsConfig, create, merge_model, split_model
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.traverse import EVENTS
@@ -30,15 +30,15 @@ def weights_of(made, **other) -> Weights:
 
 
 def logits_of(made, images=IMAGES) -> np.ndarray:
-    return np.asarray(forward(*take_apart(made), images))
+    return np.asarray(forward(*split_model(made), images))
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def after_evaluation(graph, variables, images, key):
     """The variables after a forward pass without training, with dropout even."""
-    made = put_together(graph, variables)
+    made = merge_model(graph, variables)
     made(images, key=key)
-    return take_apart(made)[1]
+    return split_model(made)[1]
 
 
 # ---- What it computes
@@ -46,7 +46,7 @@ def after_evaluation(graph, variables, images, key):
 
 def test_logits_are_those_of_numpy_in_the_order_of_the_events():
     made = estimator()
-    features = np.asarray(features_of(*take_apart(made), IMAGES), np.float64)
+    features = np.asarray(features_of(*split_model(made), IMAGES), np.float64)
     heads = {name: array.astype(np.float64) for name, array in host(nnx.state(made.heads, nnx.Param)).items()}
     wanted = []
     for event in ("step", "obstacle", "tilt"):
@@ -61,7 +61,7 @@ def test_each_sample_is_on_its_own_without_batch_statistics():
 
 
 def test_only_training_moves_the_running_statistics():
-    graph, variables = take_apart(estimator())
+    graph, variables = split_model(estimator())
     require_equal(host(after_evaluation(graph, variables, IMAGES, jax.random.key(0))), host(variables))
     moved = differing(host(in_training(graph, variables, IMAGES, jax.random.key(0))[1]), host(variables))
     assert moved == {name for name in host(variables) if name.endswith(("/mean", "/var"))}
@@ -132,7 +132,7 @@ def test_weights_set_the_trunk():
     assert actual.keys() == wanted.keys()
     for name, array in wanted.items():
         np.testing.assert_allclose(actual[name], array, rtol=1e-6, err_msg=name)  # gamma is computed
-    features = [features_of(*take_apart(one), IMAGES) for one in (made, estimator(5))]
+    features = [features_of(*split_model(one), IMAGES) for one in (made, estimator(5))]
     np.testing.assert_allclose(*features, rtol=1e-4, atol=1e-5)
 
 
@@ -151,24 +151,24 @@ def test_weights_of_another_trunk_are_refused(config, other, field):
 
 
 def test_taken_apart_and_put_together_it_is_the_same_with_variables_of_its_own():
-    graph, variables = take_apart(estimator())
+    graph, variables = split_model(estimator())
     assert tuple(variables) == VARIABLES == ("trunk", "heads", "statistics")
     names = {part: set(host(state)) for part, state in variables.items()}
     assert all(name.endswith(("/mean", "/var")) for name in names["statistics"])
     assert {name.split("/")[0] for name in names["heads"]} == {"heads"}
     assert len(names["trunk"]) == 3 * 5 and len(names["statistics"]) == 2 * 5 and len(names["heads"]) == 3 * 4
     before = host(variables)
-    again = put_together(graph, variables)
+    again = merge_model(graph, variables)
     np.testing.assert_array_equal(logits_of(again), logits_of(estimator()))
     again.trunk.conv1.mean[...] += 1
     again.heads.step.logit.bias[...] += 1
     require_equal(host(variables), before)
-    require_equal(host(take_apart(estimator())[1]), before)
+    require_equal(host(split_model(estimator())[1]), before)
 
 
 def test_estimators_of_the_same_configuration_share_their_graph():
     """`jit` compiles once for it."""
-    one, other = (take_apart(create(TRUNK, HeadsConfig(16), seed))[0] for seed in (0, 1))
+    one, other = (split_model(create(TRUNK, HeadsConfig(16), seed))[0] for seed in (0, 1))
     assert one == other and hash(one) == hash(other)
 
 

@@ -28,7 +28,7 @@ def test_noise_and_withheld_points_of_a_las_file_are_left_out(tmp_path, form):
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_a_las_file_is_read_a_chunk_at_a_time(tmp_path, monkeypatch, suffix):
-    monkeypatch.setattr(las, "CHUNK", 100)
+    monkeypatch.setattr(las, "POINTS_AT_ONCE", 100)
     heights = uneven(20, 24)
     path = write_las(tmp_path / f"site.{suffix}", points_of(heights, CELL))
     np.testing.assert_array_equal(read(path).heights, heights)

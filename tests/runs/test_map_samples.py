@@ -210,7 +210,7 @@ def test_the_summary_counts():
 
 
 def test_a_source_is_of_all_trajectories_and_of_maps_relative_to_their_centre():
-    source = MapSource.of(dataset().heights, HUSKY, FEW, GRID, 0.5)
+    source = MapSource.from_maps(dataset().heights, HUSKY, FEW, GRID, 0.5)
     assert source.stencil is stencil(HUSKY, FEW, GRID)
     wanted = np.stack([above_centre(dataset().heights[index]) for index in (3, 1)]) / 0.5
     np.testing.assert_allclose(source.elevation(np.array([3, 1])), wanted, atol=1e-6)

@@ -10,11 +10,10 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save, save_file
 
-from tests import training
 from tests.field_runs import RUN, estimator
 from tests.small_training import host, require_equal, run_of
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.resnet.weight_files import open_arrays, write_safetensors
 from travjax.runs.model_file import read_model, write_model
 from travjax.runs.predictor import DEFAULT, WEIGHTS
@@ -54,8 +53,8 @@ def refusal(file) -> str:
 def test_a_hazard_field_comes_back_bit_for_bit(file):
     run, network, notes = read_model(file)
     assert (run, notes) == (RUN, NOTES)
-    require_equal(host(take_apart(network)[1]), host(take_apart(estimator())[1]))
-    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(take_apart(network)[1]))
+    require_equal(host(split_model(network)[1]), host(split_model(estimator())[1]))
+    assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(split_model(network)[1]))
 
 
 def test_a_resnet_comes_back_bit_for_bit(tmp_path):
@@ -63,7 +62,7 @@ def test_a_resnet_comes_back_bit_for_bit(tmp_path):
     write_model(path, run_of(), made, {})
     run, network, notes = read_model(path)
     assert (run, notes) == (run_of(), {})
-    require_equal(host(take_apart(network)[1]), host(take_apart(made)[1]))
+    require_equal(host(split_model(network)[1]), host(split_model(made)[1]))
 
 
 def test_the_same_estimator_gives_the_same_file_and_another_another(file, tmp_path):
@@ -77,7 +76,7 @@ def test_arrays_are_named_by_their_place(file):
     assert any(name.endswith("stem/kernel") for name in arrays)
     assert {name.split("/")[0] for name in arrays} == {"trunk", "heads", "statistics"}
     assert sum(array.size for array in arrays.values()) == sum(
-        leaf.size for leaf in jax.tree.leaves(take_apart(estimator())[1])
+        leaf.size for leaf in jax.tree.leaves(split_model(estimator())[1])
     )
 
 
@@ -163,7 +162,7 @@ def test_arrays_of_another_estimator_are_named(tmp_path):
 
 def test_no_bit_that_turned_over_gives_another_estimator(file):
     """200 of them: a file is refused, or it is what it was but for the key of its checksums, which is said."""
-    whole, wanted = file.read_bytes(), host(take_apart(estimator())[1])
+    whole, wanted = file.read_bytes(), host(split_model(estimator())[1])
     length = struct.unpack("<Q", whole[:8])[0] + 8
     chosen, refused = random.Random(0), 0
     for number in range(200):
@@ -177,7 +176,7 @@ def test_no_bit_that_turned_over_gives_another_estimator(file):
             refused += 1
         else:  # 1e-05 and 1E-05 are the same number
             assert (run, notes) == (RUN, NOTES)
-            require_equal(host(take_apart(network)[1]), wanted)
+            require_equal(host(split_model(network)[1]), wanted)
     assert refused >= 195
 
 
@@ -213,7 +212,7 @@ def test_a_file_without_checksums_is_read_and_said_to_have_none(file, capsys):
     rewritten(file, described=described(file))
     run, network, notes = read_model(file)
     assert (run, notes) == (RUN, NOTES)
-    require_equal(host(take_apart(network)[1]), host(take_apart(estimator())[1]))
+    require_equal(host(split_model(network)[1]), host(split_model(estimator())[1]))
     said = capsys.readouterr().out
     assert said.startswith(f"{file}: has no checksums, ") and said.count("\n") == 1
 
@@ -225,8 +224,8 @@ def test_numbers_that_are_none_are_neither_read_nor_written(file, tmp_path, valu
         array[-1] = value
         return array
 
-    graph, variables = take_apart(estimator())
-    broken = put_together(
+    graph, variables = split_model(estimator())
+    broken = merge_model(
         graph, jax.tree.map(lambda leaf: spoilt(np.array(leaf)) if leaf.ndim == 1 else leaf, variables)
     )
     with pytest.raises(InputError, match=rf"new.safetensors: .* = {value}: must be finite throughout"):

@@ -18,7 +18,7 @@ from travjax.data.sampling import every_sample
 from travjax.data.sensor_noise import filled
 from travjax.devices import Devices
 from travjax.evaluation import metrics
-from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.inference import map_hazards
 from travjax.runs.map_samples import MapSource
@@ -101,7 +101,7 @@ def test_a_folder_without_such_a_checkpoint_is_refused(field):
 
 def test_probabilities_are_those_of_the_evaluation(field):
     run, network, _ = load_estimator(field)
-    evaluator = Evaluator.of(run, dataset(), Devices.all())
+    evaluator = Evaluator.from_run(run, dataset(), Devices.all())
     samples = every_sample(dataset().labels, dataset().maps_of("test"))
     found = predict(dataset().heights[dataset().maps_of("test")], field)
     assert found.shape == (6, len(FEW), 3)
@@ -112,7 +112,7 @@ def test_probabilities_are_those_of_the_evaluation(field):
 def test_a_resnet_predicts_what_the_evaluation_says():
     predictor, counts, maps = Predictor(run_of(), resnet()), [], dataset().maps_of("test")[:2]
     found = predictor.predict(dataset().heights[maps], counts.append)
-    wanted = Evaluator.of(run_of(), dataset(), Devices.all()).whole_maps(resnet(), maps)
+    wanted = Evaluator.from_run(run_of(), dataset(), Devices.all()).whole_maps(resnet(), maps)
     np.testing.assert_allclose(found.probability, wanted, atol=1e-5)
     assert found.margins is None and predictor.run.preset.model == "resnet50" and sum(counts) == 2 * len(FEW)
     one = predictor.predict(dataset().heights[maps[1]]).probability
@@ -126,8 +126,8 @@ def test_a_resnet_is_loaded_from_its_run(trained):
 def test_probabilities_and_margins_are_the_network_s(tiny):
     heights = dataset().heights[:6]
     found = tiny.predict(heights)
-    source = MapSource.of(heights, HUSKY, FEW, GRID, RUN.preset.elevation_scale)
-    hazards = np.asarray(map_hazards(*take_apart(tiny.network), source, np.arange(6)), np.float64)
+    source = MapSource.from_maps(heights, HUSKY, FEW, GRID, RUN.preset.elevation_scale)
+    hazards = np.asarray(map_hazards(*split_model(tiny.network), source, np.arange(6)), np.float64)
     np.testing.assert_allclose(found.probability, 1 / (1 + np.exp(-hazards[..., :3])), atol=1e-6)
     np.testing.assert_allclose(found.margins, hazards[..., 3:] * HUSKY.limits, atol=1e-5)
     assert found.probability.shape == found.margins.shape == (6, len(FEW), 3)
@@ -153,10 +153,10 @@ def test_a_map_alone_and_one_of_many_are_the_same(tiny):
 
 def spoilt(network, value: float, part: str):
     """The estimator with one weight set to a value."""
-    graph, variables = take_apart(network)
+    graph, variables = split_model(network)
     leaves, structure = jax.tree.flatten(variables[part])
     leaves[0] = leaves[0].at[(0,) * leaves[0].ndim].set(value)
-    return put_together(graph, variables | {part: jax.tree.unflatten(structure, leaves)})
+    return merge_model(graph, variables | {part: jax.tree.unflatten(structure, leaves)})
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -246,25 +246,25 @@ def test_heights_that_cannot_be_are_refused(tiny, heights, said):
 
 
 def test_another_robot_is_refused_with_both_named(tiny):
-    said = refusal(tiny.require_same, Robot.load("seekur_jr"))
+    said = refusal(tiny.require_trained_for, Robot.load("seekur_jr"))
     assert said == "robot = 'Seekur Jr': must be Husky A200, which the estimator was trained for"
-    said = refusal(tiny.require_same, replace(HUSKY, max_step=0.2))
+    said = refusal(tiny.require_trained_for, replace(HUSKY, max_step=0.2))
     assert said == (
         "robot = 'Husky A200': must be Husky A200 of other dimensions or limits, which the estimator was trained for"
     )
 
 
 def test_another_action_space_or_grid_is_refused_with_both_named(tiny):
-    said = refusal(tiny.require_same, actions=ActionSpace())
+    said = refusal(tiny.require_trained_for, actions=ActionSpace())
     assert said.startswith("actions = ActionSpace(turns=18, ") and f"must be {FEW}, which the estimator" in said
-    said = refusal(tiny.require_same, grid=replace(GRID, size=8))
+    said = refusal(tiny.require_trained_for, grid=replace(GRID, size=8))
     allowed = "Grid(size=4, spacing=0.125), which the estimator was trained for"
     assert said == f"grid = Grid(size=8, spacing=0.125): must be {allowed}"
 
 
 def test_its_own_robot_and_actions_are_taken(tiny):
-    tiny.require_same()
-    tiny.require_same(Robot.load("husky_a200"), FEW, GRID)
+    tiny.require_trained_for()
+    tiny.require_trained_for(Robot.load("husky_a200"), FEW, GRID)
 
 
 # ---- The estimator that comes with the package

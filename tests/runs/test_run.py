@@ -11,7 +11,7 @@ from tests.commandline import FEW
 from tests.small_training import GRID, HUSKY, PRESET, copy, host, loads, require_equal, run_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import create, take_apart
+from travjax.models.trajectory_resnet import create, split_model
 from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.preset import EvaluationConfig
 from travjax.runs.run import TRAINED, Run, load_estimator
@@ -77,7 +77,7 @@ def test_a_setting_that_was_altered_is_named(tmp_path, place, value, message):
 
 def test_what_does_not_matter_to_a_run_that_has_begun_may_differ():
     preset = replace(PRESET, weights="w.npz", robot="./husky.toml", evaluation=EvaluationConfig(1, 1))
-    run_of().require_same(replace(run_of(), preset=preset), "the run")
+    run_of().require_same_settings(replace(run_of(), preset=preset), "the run")
 
 
 @pytest.mark.parametrize(
@@ -90,12 +90,12 @@ def test_what_does_not_matter_to_a_run_that_has_begun_may_differ():
     ],
 )
 def test_the_first_setting_that_differs_is_named(other, name, values):
-    message = refusal(run_of().require_same, other, "--resume runs/a")
+    message = refusal(run_of().require_same_settings, other, "--resume runs/a")
     assert message == f"--resume runs/a: {name} = {values[0]}: must be {values[1]}, as in the run so far"
 
 
 def test_the_same_run_is_the_same():
-    run_of().require_same(run_of(), "--resume")
+    run_of().require_same_settings(run_of(), "--resume")
 
 
 # ---- Shapes for checkpoints
@@ -104,7 +104,7 @@ def test_the_same_run_is_the_same():
 @pytest.mark.parametrize("phase", [0, 1, 2])
 def test_the_template_has_the_shapes_of_the_state(phase):
     run = run_of()
-    state = take_apart(create(PRESET.trunk, PRESET.heads))[1]
+    state = split_model(create(PRESET.trunk, PRESET.heads))[1]
     if phase:
         trained = {name: state[name] for name in TRAINED[phase]}
         state = state | {"optimizer": PRESET.training.optimizer(phase, 9).init(trained)}
@@ -116,7 +116,7 @@ def test_the_template_has_the_shapes_of_the_state(phase):
 
 
 def test_the_graph_is_that_of_an_estimator():
-    graph = take_apart(create(PRESET.trunk, PRESET.heads, seed=8))[0]
+    graph = split_model(create(PRESET.trunk, PRESET.heads, seed=8))[0]
     assert run_of().graph() == graph and hash(run_of().graph()) == hash(graph)
 
 
@@ -130,11 +130,11 @@ def test_an_estimator_is_that_of_its_checkpoint(trained, which, phase, total):
     if phase:
         assert (meta["position"]["phase"], meta["position"]["total"]) == (phase, total)
     saved = {name: array for name, array in saved_state(trained, which).items() if not name.startswith("optimizer")}
-    require_equal(host(take_apart(estimator)[1]), saved)
+    require_equal(host(split_model(estimator)[1]), saved)
 
 
 def test_best_is_what_is_loaded_unless_told_otherwise(trained):
-    one, other = (host(take_apart(load_estimator(trained, *which)[1])[1]) for which in ((), ("best",)))
+    one, other = (host(split_model(load_estimator(trained, *which)[1])[1]) for which in ((), ("best",)))
     require_equal(one, other)
 
 
@@ -182,14 +182,14 @@ def test_hidden_files_that_others_leave_in_a_checkpoint_do_not_count(trained, tm
     for checkpoint in (folder / "checkpoints").iterdir():
         (checkpoint / ".DS_Store").write_text("Finder")
         (checkpoint / "state" / ".nfs0001").write_text("NFS")
-    one, other = (host(take_apart(load_estimator(place)[1])[1]) for place in (folder, trained))
+    one, other = (host(split_model(load_estimator(place)[1])[1]) for place in (folder, trained))
     require_equal(one, other)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_an_estimator_with_a_number_that_is_none_is_refused(tmp_path, value):
     run_of().save(tmp_path)
-    variables = take_apart(create(PRESET.trunk, PRESET.heads))[1]
+    variables = split_model(create(PRESET.trunk, PRESET.heads))[1]
     spoilt = jax.tree.map(lambda leaf: leaf.at[0].set(value) if leaf.ndim == 1 else leaf, variables)
     position = {"phase": 1, "epoch": 0, "step": 0, "total": 0, "loss": 0.0, "samples": 0, "best": 0.0}
     meta = {"optimizer": 0, "position": position, "dataset": "", "run": run_of().to_json()}

@@ -15,7 +15,7 @@ from travjax.devices import Devices
 from travjax.evaluation.baselines import slope_and_step
 from travjax.evaluation.metrics import PAPER_SYNTHETIC, average_precision
 from travjax.models.input_images import render_inputs
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import unpacked
@@ -24,7 +24,7 @@ from travjax.training.evaluator import Evaluator
 
 @pytest.fixture(scope="module")
 def evaluator() -> Evaluator:
-    return Evaluator.of(run_of(), dataset(), Devices.all())
+    return Evaluator.from_run(run_of(), dataset(), Devices.all())
 
 
 def pairs(samples) -> list[tuple[int, int]]:
@@ -72,7 +72,7 @@ def test_failures_are_those_of_the_labels(evaluator):
 def test_a_data_set_without_test_maps_is_refused():
     data = replace(dataset(), split=np.minimum(dataset().split, 1))
     with pytest.raises(InputError, match="test") as raised:
-        Evaluator.of(run_of(), data, Devices.all()).samples(0, 0)
+        Evaluator.from_run(run_of(), data, Devices.all()).samples(0, 0)
     assert "\n" not in str(raised.value)
 
 
@@ -103,7 +103,7 @@ def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
         "travjax.devices.Devices.check_batch", lambda self, size: require(size == 9, "batch_size", size, "9")
     )
     with pytest.raises(InputError, match="batch_size = 8"):
-        Evaluator.of(run_of(), dataset(), Devices.all())
+        Evaluator.from_run(run_of(), dataset(), Devices.all())
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
 )
 def test_a_data_set_of_something_else_is_refused(other):
     with pytest.raises(InputError, match=f"^{next(iter(other))} of the data set: ") as raised:
-        Evaluator.of(replace(run_of(), **other), dataset(), Devices.all())
+        Evaluator.from_run(replace(run_of(), **other), dataset(), Devices.all())
     assert "\n" not in str(raised.value)
 
 
@@ -122,7 +122,7 @@ def test_probabilities_are_those_of_a_forward_pass_on_images(evaluator):
     samples, counts = evaluator.samples(4, 5), []
     actual = evaluator.probabilities(estimator(), samples, counts.append)
     images = render_inputs(dataset().heights, *samples, HUSKY, FEW, grid=GRID, elevation_scale=0.5)
-    wanted = 1 / (1 + np.exp(-np.asarray(forward(*take_apart(estimator()), images), np.float64)))
+    wanted = 1 / (1 + np.exp(-np.asarray(forward(*split_model(estimator()), images), np.float64)))
     assert actual.shape == (20, 3) and wanted.std() > 0.01
     np.testing.assert_allclose(actual, wanted, atol=1e-4)
     assert counts == [8, 8, 4]
@@ -137,9 +137,9 @@ def test_probabilities_do_not_depend_on_their_company(evaluator):
 
 def test_the_estimator_is_left_as_it_was(evaluator):
     images = np.zeros((2, *GRID.shape, 3), np.float32)
-    before = np.asarray(forward(*take_apart(estimator(7)), images))
+    before = np.asarray(forward(*split_model(estimator(7)), images))
     evaluator.probabilities(estimator(7), evaluator.samples(1, 3))
-    np.testing.assert_array_equal(forward(*take_apart(estimator(7)), images), before)
+    np.testing.assert_array_equal(forward(*split_model(estimator(7)), images), before)
 
 
 def test_the_baseline_is_a_regression_on_balanced_training_samples(evaluator):
@@ -189,6 +189,6 @@ def test_a_data_set_whose_labels_say_known_where_its_map_is_unknown_is_refused()
     data = field_runs.dataset()
     heights = np.array(data.heights)
     heights[data.maps_of("test")[0], : GRID.nodes // 2] = np.nan
-    spoilt = Evaluator.of(field_runs.RUN, replace(data, heights=heights), Devices.all())
+    spoilt = Evaluator.from_run(field_runs.RUN, replace(data, heights=heights), Devices.all())
     with pytest.raises(InputError, match="^data set, margins = 'NaN': must be known trajectories alone"):
         spoilt.margins(field_runs.estimator(), spoilt.samples(0, 0))

@@ -11,7 +11,7 @@ from tests.field_runs import CONFIG, PRESET, RUN, begun, trainer
 from tests.small_training import copy, dataset, require_equal, rows_of, run_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.inference import hazards
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import EVENTS
@@ -74,20 +74,20 @@ def test_margins_count_by_their_weight(tmp_path):
 
 def test_a_trained_field_predicts_margins(whole):
     run, network, meta = load_estimator(whole)
-    evaluator = Evaluator.of(run, dataset(), Devices.all())
+    evaluator = Evaluator.from_run(run, dataset(), Devices.all())
     samples = evaluator.samples(0, 0)
     predicted, true = evaluator.margins(network, samples)
     assert predicted.shape == true.shape == (len(samples[0]), len(EVENTS)) and true.max() <= 4
     failed = evaluator.failed(samples)
     np.testing.assert_array_equal(true > 1, failed)
-    whole_maps = hazards(*take_apart(network), evaluator.source, np.unique(samples[0]), evaluator.devices)
+    whole_maps = hazards(*split_model(network), evaluator.source, np.unique(samples[0]), evaluator.devices)
     np.testing.assert_allclose(predicted, np.minimum(whole_maps[..., 3:].reshape(predicted.shape), 4), atol=1e-5)
     assert meta["position"]["phase"] == 2 and network.trunk.config == CONFIG
 
 
 def test_whole_maps_and_samples_agree(whole):
     run, network, _ = load_estimator(whole)
-    evaluator = Evaluator.of(run, dataset(), Devices.all())
+    evaluator = Evaluator.from_run(run, dataset(), Devices.all())
     maps = dataset().maps_of("test")[[2, 0]]
     by_map = evaluator.whole_maps(network, maps)
     samples = (np.array([maps[1], maps[0], maps[1]]), np.array([3, 5, len(FEW) - 1]))

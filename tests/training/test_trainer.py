@@ -36,7 +36,7 @@ from travjax.devices import Devices
 from travjax.evaluation import metrics
 from travjax.evaluation.score_figures import training_figure
 from travjax.models.input_images import ImageSource, render_inputs, trajectory_bank
-from travjax.models.trajectory_resnet import HeadsConfig, create, put_together, take_apart
+from travjax.models.trajectory_resnet import HeadsConfig, create, merge_model, split_model
 from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.inference import probabilities
@@ -78,7 +78,7 @@ def refusal(call, *arguments, **options) -> str:
 
 
 def state_of(made, phase: int, optimizer) -> dict:
-    variables = jax.tree.map(jax.numpy.array, take_apart(made)[1])  # a step takes its state apart
+    variables = jax.tree.map(jax.numpy.array, split_model(made)[1])  # a step takes its state apart
     return variables | {"optimizer": optimizer.init({name: variables[name] for name in TRAINED[phase]})}
 
 
@@ -110,7 +110,7 @@ def numpy_step(heads: dict, nu: dict, features, failed, weight, rate: float, dec
 def test_steps_of_the_heads_are_those_of_numpy():
     made = create(PRESET.trunk, HeadsConfig(5, dropout=0.0), seed=3)
     optimizer = replace(PRESET.training, learning_rate=0.01).optimizer(1, 1)
-    graph, state = take_apart(made)[0], state_of(made, 1, optimizer)
+    graph, state = split_model(made)[0], state_of(made, 1, optimizer)
     heads = {name: array.astype(np.float64) for name, array in host(state["heads"]["heads"]).items()}
     nu = {name: np.zeros_like(array) for name, array in heads.items()}
     random = np.random.default_rng(0)
@@ -146,7 +146,7 @@ def test_rmsprop_adds_epsilon_outside_of_the_root():
 def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
     samples = tuple(index[:8] for index in trainer_samples())
     made, optimizer = estimator(2), PRESET.training.optimizer(2, 1)
-    graph, state = take_apart(made)[0], state_of(made, 2, optimizer)
+    graph, state = split_model(made)[0], state_of(made, 2, optimizer)
     weight = np.array([1, 1, 1, 1, 1, 1, 0, 0], np.float32)
     moved, loss = update(
         state,
@@ -161,7 +161,7 @@ def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
         penalty=PRESET.training.weight_decay,
     )
     key = jax.random.fold_in(jax.random.key(11), 4)
-    logits, after = in_training(*take_apart(made), images_of(samples), key)
+    logits, after = in_training(*split_model(made), images_of(samples), key)
     wanted = (entropy(logits, failed_of(samples)) * weight).sum() / 6
     assert float(loss) == pytest.approx(wanted, rel=1e-4)
     for name, array in host(after["statistics"]).items():
@@ -181,7 +181,7 @@ def trainer_samples(count: int = 32):
 def test_a_narrow_trunk_learns_32_samples_by_heart():
     made = create(replace(PRESET.trunk, width=8), HeadsConfig(16, dropout=0.0))
     optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").optimizer(2, 300)
-    graph, state = take_apart(made)[0], state_of(made, 2, optimizer)
+    graph, state = split_model(made)[0], state_of(made, 2, optimizer)
     samples = trainer_samples(32)
     failed, weight, put = failed_of(samples).astype(np.float32), np.ones(32, np.float32), jax.device_put(source())
     assert len(failed) == 32 and 0.2 < failed.any(axis=1).mean() < 0.9
@@ -233,9 +233,9 @@ def test_without_head_epochs_everything_is_trained_from_the_start(tmp_path):
 
 def test_the_features_of_the_frozen_trunk_are_those_of_a_forward_pass(tmp_path):
     made = trainer(tmp_path)
-    made.start(put_together(*take_apart(estimator(1))))
+    made.start(merge_model(*split_model(estimator(1))))
     for name, samples in (("training", made.data.samples(1, 0)), ("validation", made.data.validation)):
-        wanted = features_of(*take_apart(estimator(1)), images_of(samples))
+        wanted = features_of(*split_model(estimator(1)), images_of(samples))
         np.testing.assert_allclose(made.features[name], wanted, rtol=1e-4, atol=1e-5)
 
 
@@ -276,7 +276,7 @@ def test_watched_samples_are_scored_before_training_and_after_each_epoch(tmp_pat
             probability = probabilities(np.asarray(forward(graph, variables, images_of(samples))))
             wanted = metrics.confusions(probability, made.data.failed(samples).astype(bool))
             for event, counts in wanted.items():
-                assert row["watched"][name][event]["confusion"] == metrics.to_json(counts)
+                assert row["watched"][name][event]["confusion"] == metrics.json_ready(counts)
 
 
 def test_training_does_not_depend_on_watched_samples(tmp_path):
@@ -377,7 +377,7 @@ def test_each_row_says_where_it_stands(trained):
 
 def test_the_validation_is_that_of_the_estimator(trained, tmp_path):
     samples, row = trainer(tmp_path).data.validation, validations(trained)[-1]
-    logits = forward(*take_apart(load_estimator(trained, "latest")[1]), images_of(samples))
+    logits = forward(*split_model(load_estimator(trained, "latest")[1]), images_of(samples))
     failed = failed_of(samples)
     assert row["validation_loss"] == pytest.approx(entropy(logits, failed).mean(), rel=1e-4)
     share = failed.mean(axis=0)

@@ -9,7 +9,7 @@ from travjax import progress
 from travjax.commands import options
 from travjax.config import require
 from travjax.evaluation import tables
-from travjax.files import output_folder, written_whole
+from travjax.files import atomic_write, output_folder
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -59,7 +59,7 @@ def _write(rows: list[dict], columns: dict[str, str], path: Path) -> None:
     from travjax.evaluation import simulator_benchmark
 
     print(f"\n{simulator_benchmark.machine()}\n{tables.rows_table(rows, columns)}\n")
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         simulator_benchmark.write_tsv(rows, temporary, columns)
     progress.wrote(path)
 

@@ -108,7 +108,7 @@ def evaluate(
     from travjax.training.evaluator import Evaluator
 
     trained, estimator, meta = load_estimator(folder, checkpoint)
-    evaluator = Evaluator.of(trained, dataset.load(data or folder / DATA), Devices.all())
+    evaluator = Evaluator.from_run(trained, dataset.load(data or folder / DATA), Devices.all())
     name = "evaluation" if checkpoint == "best" else f"evaluation_{checkpoint}"
     out = output_folder(out or folder / name)
     sampled = trained.preset.evaluation
@@ -174,7 +174,7 @@ def _write_tables(
     errors: np.ndarray | None,
 ) -> None:
     from travjax.evaluation import tables
-    from travjax.evaluation.metrics import to_json
+    from travjax.evaluation.metrics import json_ready
     from travjax.simulation.traverse import EVENTS
 
     paper = evaluator.paper
@@ -193,8 +193,8 @@ def _write_tables(
         parts += [f"{MARGINS.capitalize()}:\n{tables.metrics_table(others[MARGINS], paper)}", _margin_errors(errors)]
     text = "\n\n".join(parts)
     print(f"\n{text}\n")
-    results = {"sample": description, "network": to_json(scores)}
-    results |= {name: to_json(other) for name, other in others.items()}
+    results = {"sample": description, "network": json_ready(scores)}
+    results |= {name: json_ready(other) for name, other in others.items()}
     if errors is not None:
         results["margin_errors"] = dict(zip(EVENTS, errors.tolist(), strict=True))
     for name, content in (("tables.txt", text), ("evaluation.json", json.dumps(results, indent=1, allow_nan=False))):

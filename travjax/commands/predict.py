@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> None:
     predictor = Predictor.load(arguments.checkpoint)
     model, trained = predictor.run.preset.model, predictor.run
     require(arguments.model in (None, model), "--model", arguments.model, f"{model}, which the estimator is")
-    predictor.require_same(Robot.load(arguments.robot) if arguments.robot else None)
+    predictor.require_trained_for(Robot.load(arguments.robot) if arguments.robot else None)
     total, source, files = label.maps_of(arguments, trained.grid)
     out = output_folder(arguments.out)
     config = options.configuration_json(

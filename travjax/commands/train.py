@@ -162,7 +162,7 @@ def _check_folder(folder: Path, wanted: "Run", resume: bool, option: str) -> Non
 
     if not resume:
         raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
-    Run.load(folder).require_same(wanted, f"{option} {folder}")
+    Run.load(folder).require_same_settings(wanted, f"{option} {folder}")
 
 
 def _dataset(data: Path | None, wanted: "Run", folder: Path, devices: "Devices") -> "Dataset":

@@ -31,8 +31,8 @@ from travjax.config import (
 )
 from travjax.data.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, read_table
 from travjax.data.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
-from travjax.data.sampling import UNKNOWN, random_keys
-from travjax.files import folder_written_whole, put_back, sha256, user_path
+from travjax.data.sampling import UNKNOWN_LABEL, random_keys
+from travjax.files import atomic_write_folder, put_back, sha256, user_path
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
@@ -43,7 +43,7 @@ from travjax.terrain.styles import STYLES, generate_terrain, require_world
 ARRAYS = ("heights", "labels", "group", "seed", "split")
 """Each is a file of its own, `heights.npy` and so on; real maps have PROVENANCE_ARRAYS as well."""
 
-CHUNK = 256
+MAPS_AT_ONCE = 256
 """Maps made and labelled before they are copied into the arrays."""
 
 Progress = Callable[[int], object]
@@ -167,7 +167,7 @@ class Dataset:
         wrong = self.split[self.split >= len(SPLITS)]
         require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
         largest = int(self.labels.max(initial=0))
-        require(largest < 2 * UNKNOWN, "labels", largest, f"from 0 to {2 * UNKNOWN - 1}")
+        require(largest < 2 * UNKNOWN_LABEL, "labels", largest, f"from 0 to {2 * UNKNOWN_LABEL - 1}")
         groups = STYLES if self.config else self.provenance and [site.name for site in self.provenance.sites]
         unknown = self.group[~np.isin(self.group, groups)] if groups else self.group[:0]
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
@@ -204,8 +204,8 @@ def generate(
     styles, seeds = config.styles(), config.seeds()
     heights = np.empty((config.maps, *grid.shape), np.float32)
     labels = np.empty((config.maps, len(actions)), np.uint8)
-    for start in range(0, config.maps, CHUNK):
-        chunk = slice(start, min(start + CHUNK, config.maps))
+    for start in range(0, config.maps, MAPS_AT_ONCE):
+        chunk = slice(start, min(start + MAPS_AT_ONCE, config.maps))
         made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid, world=config.world)
         margins = simulate(made, robot, actions, grid=grid)
         labels[chunk] = packed(failures(margins, robot), margins.known)
@@ -215,7 +215,7 @@ def generate(
     return Dataset(heights, labels, styles, seeds, config.splits(), robot, actions, grid, config)
 
 
-def require_same(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+def require_matching(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
     """Raises InputError, which names both, unless the data set is labelled for this robot, action space and grid."""
     for name, given in (("robot", robot), ("actions", actions), ("grid", grid)):
         ours = getattr(dataset, name)
@@ -234,7 +234,7 @@ def configs_to_json(dataset: Dataset) -> dict[str, Any]:
     return table | ({"provenance": dataset.provenance.to_json()} if dataset.provenance else {})
 
 
-def put_together(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
+def dataset_from_arrays(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
     """The data set of what `configs_to_json` gave and its arrays; raises InputError when they are something else."""
     synthetic = table.get("config") is not None
     kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid} | ({"config": DatasetConfig} if synthetic else {})
@@ -251,7 +251,7 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
     on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
     or when it cannot be written: a full disk, no permission.
     """
-    with folder_written_whole(user_path(folder), is_dataset) as temporary:
+    with atomic_write_folder(user_path(folder), is_dataset) as temporary:
         arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
         files = {name: _write(temporary / name, array, on_progress) for name, array in arrays.items()}
         table = {"format": FORMAT, "version": FORMAT_VERSION} | configs_to_json(dataset) | {"files": files}
@@ -275,7 +275,7 @@ def load(folder: str | Path) -> Dataset:
     arrays = {name: _read_array(folder / f"{name}.npy") for name in names}
     try:
         with naming(folder):
-            return put_together(table, arrays)
+            return dataset_from_arrays(table, arrays)
     except InputError as error:
         raise InputError(f"{folder}: {error}") from None
 

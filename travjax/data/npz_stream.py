@@ -10,7 +10,7 @@ from typing import IO
 import numpy as np
 
 from travjax.config import InputError
-from travjax.files import written_whole
+from travjax.files import atomic_write
 from travjax.rasters.memory import require_disk
 
 SMALL = 1024
@@ -69,7 +69,7 @@ class NpzStream:
     def save(self, without: Collection[str] = (), **more: np.ndarray | str | float) -> Path:
         """Writes what was added, and arrays beside it, to the .npz, whole or not at all; `without` is left out."""
         with (
-            written_whole(self.path) as temporary,
+            atomic_write(self.path) as temporary,
             zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive,
         ):
             for name, (file, dtype, shape) in self._files.items():

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError
-from travjax.data.dataset import CHUNK, Dataset, Progress
+from travjax.data.dataset import MAPS_AT_ONCE, Dataset, Progress
 from travjax.data.dem import Windows, load_dem
 from travjax.data.provenance import SPLITS, Provenance, Site, SiteRecord, SitesConfig, Strip
-from travjax.data.sampling import UNKNOWN
+from travjax.data.sampling import UNKNOWN_LABEL
 from travjax.files import find_data
 from travjax.rasters.coordinates import is_local, places
 from travjax.simulation.actions import ActionSpace
@@ -32,7 +32,7 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import failures, packed, simulate
 
-TRAIN, VALIDATION, TEST, TOO_UNKNOWN, NEAR_TEST, SHARED = FATES = range(6)
+TRAIN, VALIDATION, TEST, TOO_UNKNOWN, NEAR_TEST, SHARED = ASSIGNMENTS = range(6)
 """What becomes of a window: the first three are the index into SPLITS."""
 
 LEFT_OUT = {TOO_UNKNOWN: "too_unknown", NEAR_TEST: "near_test", SHARED: "shared"}
@@ -59,16 +59,16 @@ def read(
     _require_different(found)
     label = lambda heights: _labels(heights, robot, actions, grid, on_progress)
     windows = _Candidates(found)
-    labels = np.full((len(windows.site), len(actions)), UNKNOWN, np.uint8)
+    labels = np.full((len(windows.site), len(actions)), UNKNOWN_LABEL, np.uint8)
     for some, heights in windows.batches():
         enough = np.isnan(heights).mean(axis=(1, 2)) <= config.max_unknown
         labels[some[enough]] = label(heights[enough])
-    fate = _fates(config, windows, labels.min(axis=1) < UNKNOWN, grid.size)
-    records = _records(config, found, windows.site, fate)
+    assignment = _assignments(config, windows, labels.min(axis=1) < UNKNOWN_LABEL, grid.size)
+    records = _records(config, found, windows.site, assignment)
     _require_all(config, records, found, grid.size)
 
-    kept = np.flatnonzero(fate <= TEST)
-    copied = np.flatnonzero(fate == TRAIN) if config.rotations else kept[:0]
+    kept = np.flatnonzero(assignment <= TEST)
+    copied = np.flatnonzero(assignment == TRAIN) if config.rotations else kept[:0]
     source = np.concatenate([kept, *[copied] * 3])
     turns = np.repeat(np.arange(4, dtype=np.uint8), [len(kept), *[len(copied)] * 3])
     heights = np.empty((len(source), *grid.shape), np.float32)
@@ -80,7 +80,7 @@ def read(
         labels=np.concatenate([labels[kept], label(heights[len(kept) :])]),
         group=np.array([site.group for site in config.site])[windows.site[source]],
         seed=np.zeros(len(source), np.uint32),
-        split=fate[source],
+        split=assignment[source],
         robot=robot,
         actions=actions,
         grid=grid,
@@ -124,8 +124,8 @@ class _Candidates:
         """Yields the indices and the heights of some windows at a time, [k] and [k, rows, cols]."""
         first = 0
         for windows in self.found:
-            for start in range(0, len(windows), CHUNK):
-                heights = windows.read(slice(start, start + CHUNK))
+            for start in range(0, len(windows), MAPS_AT_ONCE):
+                heights = windows.read(slice(start, start + MAPS_AT_ONCE))
                 yield first + start + np.arange(len(heights)), heights
             first += len(windows)
 
@@ -180,8 +180,8 @@ def _labels(
 ) -> np.ndarray:
     """The labels of maps: [n, t] uint8."""
     labels = np.empty((len(heights), len(actions)), np.uint8)
-    for start in range(0, len(heights), CHUNK):
-        chunk = slice(start, min(start + CHUNK, len(heights)))
+    for start in range(0, len(heights), MAPS_AT_ONCE):
+        chunk = slice(start, min(start + MAPS_AT_ONCE, len(heights)))
         margins = simulate(heights[chunk], robot, actions, grid=grid)
         labels[chunk] = packed(failures(margins, robot), margins.known)
         if on_progress:
@@ -189,16 +189,18 @@ def _labels(
     return labels
 
 
-def _fates(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: float) -> np.ndarray:
-    """What becomes of each window: [n] uint8, one of FATES. known: [n] whether any trajectory is."""
-    fate = np.full(len(known), TRAIN, np.uint8)
+def _assignments(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: float) -> np.ndarray:
+    """What becomes of each window: [n] uint8, one of ASSIGNMENTS. known: [n] whether any trajectory is."""
+    assignment = np.full(len(known), TRAIN, np.uint8)
     asked = {split: _asked_for(split, config, windows, size) for split in ("validation", "test")}
-    fate[~known] = TOO_UNKNOWN
-    fate[known & asked["test"]] = TEST
-    fate[(fate == TRAIN) & _near(windows, fate == TEST, size, size + config.gap - TOLERANCE)] = NEAR_TEST
-    fate[(fate == TRAIN) & asked["validation"]] = VALIDATION
-    fate[(fate == TRAIN) & _near(windows, fate == VALIDATION, size, size + TOLERANCE)] = SHARED
-    return fate
+    assignment[~known] = TOO_UNKNOWN
+    assignment[known & asked["test"]] = TEST
+    assignment[(assignment == TRAIN) & _near(windows, assignment == TEST, size, size + config.gap - TOLERANCE)] = (
+        NEAR_TEST
+    )
+    assignment[(assignment == TRAIN) & asked["validation"]] = VALIDATION
+    assignment[(assignment == TRAIN) & _near(windows, assignment == VALIDATION, size, size + TOLERANCE)] = SHARED
+    return assignment
 
 
 def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: float) -> np.ndarray:
@@ -246,19 +248,21 @@ def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -
     return near
 
 
-def _records(config: SitesConfig, found: list[Windows], site: np.ndarray, fate: np.ndarray) -> tuple[SiteRecord, ...]:
+def _records(
+    config: SitesConfig, found: list[Windows], site: np.ndarray, assignment: np.ndarray
+) -> tuple[SiteRecord, ...]:
     names = dict(enumerate(SPLITS)) | LEFT_OUT
     read = ("sha256", "cell_size", "covered", "filled", "unknown")
 
     def records() -> Iterator[SiteRecord]:
         for index, windows in enumerate(found):
-            counts = np.bincount(fate[site == index], minlength=len(FATES)).tolist()
-            fates = {names[one]: count for one, count in enumerate(counts)}
+            counts = np.bincount(assignment[site == index], minlength=len(ASSIGNMENTS)).tolist()
+            assignments = {names[one]: count for one, count in enumerate(counts)}
             as_read: dict[str, Any] = {name: getattr(windows, name) for name in read}
             as_read["crs"] = ", ".join(dict.fromkeys(windows.systems())) or None
             as_read["height_offset"] = windows.height_offset if isinstance(windows.height_offset, float) else None
             site_of = config.site[index]
-            yield SiteRecord(site_of.group, site_of.file, **as_read, windows=sum(counts), **fates)
+            yield SiteRecord(site_of.group, site_of.file, **as_read, windows=sum(counts), **assignments)
 
     return tuple(records())
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError, read_json, require
-from travjax.data.dataset import SPLITS, Dataset, configs_to_json, put_together
-from travjax.files import folder_written_whole, put_back, user_path
+from travjax.data.dataset import SPLITS, Dataset, configs_to_json, dataset_from_arrays
+from travjax.files import atomic_write_folder, put_back, user_path
 
 NAME, VERSION = "travjax", "1.0.0"
 
@@ -44,7 +44,7 @@ def export(dataset: Dataset, folder: str | Path, on_progress: Callable[[int], ob
     when tensorflow-datasets is missing, when something else lies there, or when it cannot be written.
     """
     tfds = _tensorflow_datasets()
-    with folder_written_whole(user_path(folder), _is_export) as temporary:
+    with atomic_write_folder(user_path(folder), _is_export) as temporary:
         builder = _builder_class(tfds, dataset, on_progress)(data_dir=temporary, file_format="array_record")
         downloads, no_bucket = temporary / "downloads", tfds.download.DownloadConfig(try_download_gcs=False)
         tfds.disable_progress_bar()
@@ -69,7 +69,7 @@ def read(folder: str | Path) -> Dataset:
     require(_is_export(folder), "folder", str(folder), f"one with an exported data set in {NAME}/{VERSION}")
     try:
         builder = tfds.builder_from_directory(place)
-        return put_together(builder.info.metadata, _collected(builder))
+        return dataset_from_arrays(builder.info.metadata, _collected(builder))
     except Exception as error:  # a damaged record raises whatever the reader of its format does
         raise InputError(f"{place}: damaged: {' '.join(str(error).split()) or type(error).__name__}") from None
 

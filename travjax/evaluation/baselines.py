@@ -10,7 +10,7 @@ from travjax.data.sampling import Samples
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 
-CHUNK = 4096
+SAMPLES_AT_ONCE = 4096
 
 
 def slope_and_step(
@@ -22,8 +22,8 @@ def slope_and_step(
     """
     place = np.floor(actions.poses(np.arange(len(actions)))[..., :2] / grid.spacing + grid.cells / 2 + 0.5).astype(int)
     result = np.empty((len(samples[0]), 2))
-    for start in range(0, len(result), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(result), SAMPLES_AT_ONCE):
+        part = slice(start, start + SAMPLES_AT_ONCE)
         maps, which = np.unique(samples[0][part], return_inverse=True)
         chosen = heights[maps].astype(np.float64)
         slope = np.hypot(*np.gradient(chosen, grid.spacing, axis=(1, 2)))

@@ -10,7 +10,7 @@ import numpy as np
 from travjax.config import to_json
 from travjax.data.dataset import SPLITS, Dataset
 from travjax.data.provenance import Provenance
-from travjax.data.sampling import CHUNK, FAILED, UNKNOWN, Samples, balanced_subset
+from travjax.data.sampling import FAILED, MAPS_AT_ONCE, UNKNOWN_LABEL, Samples, balanced_subset
 from travjax.evaluation.tables import PAPER_SHARES, rows_table
 from travjax.simulation.traverse import EVENTS
 
@@ -35,7 +35,7 @@ WINDOW_COLUMNS = {
     "shared": "left out:\nshared",
 }
 
-CODES = 2 * UNKNOWN
+CODES = 2 * UNKNOWN_LABEL
 """A label is a number below this."""
 
 
@@ -89,17 +89,19 @@ def balanced_subsets(dataset: Dataset) -> dict[str, Samples]:
 def label_counts(labels: np.ndarray) -> np.ndarray:
     """How often each label occurs on each map: labels [n, t] uint8, result [n, 16]."""
     counts = np.zeros((len(labels), CODES), np.int64)
-    for start in range(0, len(labels), CHUNK):
-        chunk = labels[start : start + CHUNK]
+    for start in range(0, len(labels), MAPS_AT_ONCE):
+        chunk = labels[start : start + MAPS_AT_ONCE]
         places = np.arange(len(chunk))[:, None] * CODES + chunk
-        counts[start : start + CHUNK] = np.bincount(places.ravel(), minlength=chunk.shape[0] * CODES).reshape(-1, CODES)
+        counts[start : start + MAPS_AT_ONCE] = np.bincount(places.ravel(), minlength=chunk.shape[0] * CODES).reshape(
+            -1, CODES
+        )
     return counts
 
 
 def _row(name: str, counts: np.ndarray) -> dict:
     """The shares of maps with these counts [n, 16]."""
-    known = counts[:, :UNKNOWN].sum(axis=1)
-    fails = counts[known > 0, 1:UNKNOWN].sum(axis=1)
+    known = counts[:, :UNKNOWN_LABEL].sum(axis=1)
+    fails = counts[known > 0, 1:UNKNOWN_LABEL].sum(axis=1)
     total = counts.sum()
     return {
         "what": name,
@@ -120,7 +122,7 @@ def _subset_row(name: str, labels: np.ndarray, samples: Samples) -> dict:
 
 def _shares(counts: np.ndarray) -> dict[str, str]:
     """The share of each event and of any among known trajectories, from how often each label occurs: [16]."""
-    codes, known = np.arange(UNKNOWN), counts[:UNKNOWN].sum()
+    codes, known = np.arange(UNKNOWN_LABEL), counts[:UNKNOWN_LABEL].sum()
     wanted = [1 << event for event in range(len(EVENTS))] + [FAILED]
-    shares = [counts[:UNKNOWN][(codes & bits) > 0].sum() for bits in wanted]
+    shares = [counts[:UNKNOWN_LABEL][(codes & bits) > 0].sum() for bits in wanted]
     return {name: f"{share / known:.2%}" if known else "-" for name, share in zip(PAPER_SHARES, shares, strict=True)}

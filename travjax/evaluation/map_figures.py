@@ -17,13 +17,13 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from travjax.config import one_line
-from travjax.files import written_whole
+from travjax.files import atomic_write
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import EVENTS
 
-SAFE, DOUBTFUL, FAILED, UNKNOWN = "#2a9d3a", "#f2c40f", "#d62718", "#8a8a8a"
+SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR = "#2a9d3a", "#f2c40f", "#d62718", "#8a8a8a"
 DOUBT, FAILURE = 0.25, 0.5
 """Probabilities from which a trajectory is drawn as doubtful and as failing, as in the paper."""
 TERRAIN = "gist_earth"
@@ -32,7 +32,7 @@ TERRAIN = "gist_earth"
 def save(figure: Figure, path: Path) -> Path:
     """Writes a figure as PNG, whole or not at all; names in it are drawn as they are."""
     _draw_texts_as_they_are(figure)
-    with written_whole(path) as temporary, warnings.catch_warnings():
+    with atomic_write(path) as temporary, warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from")  # of a name: a box is drawn
         figure.savefig(temporary, format="png", dpi=150)
     return path
@@ -162,7 +162,7 @@ _BANDS = (
     (SAFE, f"predicted below {DOUBT:g}, or safe"),
     (DOUBTFUL, f"predicted {DOUBT:g} to {FAILURE:g}"),
     (FAILED, f"predicted {FAILURE:g} or more, or failed"),
-    (UNKNOWN, "unknown ground"),
+    (UNKNOWN_COLOUR, "unknown ground"),
 )
 
 
@@ -170,7 +170,7 @@ def _share_title(name: str, fails: np.ndarray, known: np.ndarray) -> str:
     return f"{name}: {fails[known].mean():.1%} of known fail" if known.any() else f"{name}: all unknown"
 
 
-_KINDS = ((SAFE, "safe"), (FAILED, "failed"), (UNKNOWN, "unknown"))
+_KINDS = ((SAFE, "safe"), (FAILED, "failed"), (UNKNOWN_COLOUR, "unknown"))
 
 
 def _colour_range(heights: np.ndarray) -> tuple[float, float]:
@@ -193,12 +193,12 @@ def _draw_elevation(ax, heights, grid: Grid, low: float, high: float, colour: st
 
 def _by_label(failed: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
     """Which trajectories have each colour, the last on top."""
-    return {UNKNOWN: ~known, SAFE: known & ~failed, FAILED: known & failed}
+    return {UNKNOWN_COLOUR: ~known, SAFE: known & ~failed, FAILED: known & failed}
 
 
 def _by_probability(probability: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
     failing, safe = probability >= FAILURE, probability < DOUBT
-    return {UNKNOWN: ~known, SAFE: known & safe, DOUBTFUL: known & ~safe & ~failing, FAILED: known & failing}
+    return {UNKNOWN_COLOUR: ~known, SAFE: known & safe, DOUBTFUL: known & ~safe & ~failing, FAILED: known & failing}
 
 
 def _draw_paths(ax, paths: np.ndarray, by_colour: dict[str, np.ndarray]) -> None:

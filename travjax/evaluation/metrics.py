@@ -327,19 +327,19 @@ def _checked(probabilities, failed) -> tuple[np.ndarray, np.ndarray]:
     return probabilities, failed
 
 
-def to_json(value):
+def json_ready(value):
     """An Evaluation, or any part of one, as plain dicts, lists and numbers; what is not finite is None.
 
     A confusion brings the figures of its counts, a calibration its error, an evaluation its average precisions.
     """
     if isinstance(value, np.ndarray | np.generic):
-        return to_json(value.tolist())
+        return json_ready(value.tolist())
     if dataclasses.is_dataclass(value):
         derived = {Confusion: FIGURES, Calibration: ("error",), Evaluation: ("average_precision",)}
         names = [*(entry.name for entry in dataclasses.fields(value)), *derived.get(type(value), ())]
-        return {name: to_json(getattr(value, name)) for name in names}
+        return {name: json_ready(getattr(value, name)) for name in names}
     if isinstance(value, Mapping):
-        return {name: to_json(entry) for name, entry in value.items()}
+        return {name: json_ready(entry) for name, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [to_json(entry) for entry in value]
+        return [json_ready(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

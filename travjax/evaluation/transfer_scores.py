@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from travjax.config import require
-from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, to_json
+from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, json_ready
 from travjax.evaluation.tables import rows_table, with_notes
 
 ALL = "all held-out"
@@ -44,7 +44,7 @@ class Epoch:
     held_out: Confusions
 
     @staticmethod
-    def of(row: Mapping) -> "Epoch":
+    def from_row(row: Mapping) -> "Epoch":
         """From a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
         allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
         require(_is_scored(row), "row of metrics.jsonl", row, allowed)
@@ -73,7 +73,7 @@ def _is_scored(row: Mapping) -> bool:
 
 
 @dataclass(frozen=True)
-class Run:
+class ArmRun:
     """The epochs of one arm and seed, the first state first."""
 
     epochs: tuple[Epoch, ...]
@@ -101,12 +101,11 @@ def _or_zero(value: float | None) -> float:
 class Results:
     """All runs: by arm, and of each arm by seed."""
 
-    arms: dict[str, dict[int, Run]]
+    arms: dict[str, dict[int, ArmRun]]
 
-    @staticmethod
-    def of(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
+    def from_rows(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
         """From the rows of every arm and seed."""
-        run = lambda part: Run(tuple(Epoch.of(row) for row in part))
+        run = lambda part: ArmRun(tuple(Epoch.from_row(row) for row in part))
         return Results({arm: {seed: run(part) for seed, part in seeds.items()} for arm, seeds in rows.items()})
 
     @cached_property
@@ -250,10 +249,10 @@ def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
 def results_json(results: Results) -> dict:
     """Everything, for results.json."""
 
-    def run(one: Run) -> dict:
+    def run(one: ArmRun) -> dict:
         best = {site: one.best(site).number for site in results.sites}
-        return {"best_epoch": best, "validation_epoch": one.chosen.number, "epochs": to_json(one.epochs)}
+        return {"best_epoch": best, "validation_epoch": one.chosen.number, "epochs": json_ready(one.epochs)}
 
     arms = {arm: {str(seed): run(one) for seed, one in seeds.items()} for arm, seeds in results.arms.items()}
     always = {site: {event: results.always(site, event) for event in NAMES} for site in results.sites}
-    return {"arms": arms, "always_fails": to_json(always)}
+    return {"arms": arms, "always_fails": json_ready(always)}

@@ -22,7 +22,7 @@ from travjax.evaluation import map_figures, metrics, score_figures, simulator_be
 from travjax.evaluation.metrics import OVERALL
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch, timing
-from travjax.experiments.robustness import CLEAN, CORRUPTIONS, Ground, of_sites
+from travjax.experiments.robustness import CLEAN, CORRUPTIONS, BenchmarkMaps, of_sites
 from travjax.experiments.robustness_scores import (
     FILTERED,
     HAZARD,
@@ -136,7 +136,7 @@ def run(arguments: argparse.Namespace) -> None:
     resnet = _load("--resnet", arguments.resnet, RESNET) if arguments.resnet else None
     trained = field.run
     if resnet:
-        resnet.require_same(trained.robot, trained.actions, trained.grid)
+        resnet.require_trained_for(trained.robot, trained.actions, trained.grid)
     sites = _sites(arguments.sites, wanted)
     out = output_folder(arguments.out)
     seed, named = arguments.seed, (trained.robot, trained.actions, trained.grid)
@@ -178,10 +178,10 @@ def _sites(given: Path | None, ground: str) -> SitesConfig | None:
     return sites
 
 
-def _synthetic(what: str, count: int, seed: int, field: Predictor) -> Ground:
+def _synthetic(what: str, count: int, seed: int, field: Predictor) -> BenchmarkMaps:
     trained = field.run
     with progress.bar(f"{what} maps", count, "map") as bar:
-        return Ground.synthetic(count, seed, trained.robot, trained.actions, trained.grid, bar.update)
+        return BenchmarkMaps.synthetic(count, seed, trained.robot, trained.actions, trained.grid, bar.update)
 
 
 def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict]:
@@ -189,7 +189,7 @@ def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict
     trained = field.run
     trunk = resnet.run.preset.trunk if resnet else ResNetConfig()
     rows = timing.measured(trained.robot, trained.actions, trained.grid, trunk, 64, repeats)
-    maps = Ground.synthetic(8, SEED, trained.robot, trained.actions, trained.grid).heights
+    maps = BenchmarkMaps.synthetic(8, SEED, trained.robot, trained.actions, trained.grid).heights
     for count in (1, len(maps)):
         field.predict(maps[:count])
         taken = []
@@ -255,14 +255,14 @@ def _on_synthetic_ground(
         "Maps as sensors see them": rows_table(noisy, columns),
         "Time": rows_table(rows, timing.COLUMNS),
     }
-    numbers = {"maps": metrics.to_json(results), "times": metrics.to_json(rows)}
+    numbers = {"maps": metrics.json_ready(results), "times": metrics.json_ready(rows)}
     files = [map_figures.save(figure, out / f"{name}.png") for name, figure in figures.items()]
     return Part([headline, MEANING], tables, numbers, [out / "f1.tsv", *files])
 
 
 def _on_real_ground(
     scores: Mapping[str, SiteScores],
-    real: Mapping[str, Ground],
+    real: Mapping[str, BenchmarkMaps],
     chosen: Mapping[str, str],
     config: SitesConfig,
     field: Predictor,
@@ -284,7 +284,7 @@ def _on_real_ground(
         "sites": to_json(config),
         "windows": {site: len(ground.heights) for site, ground in real.items()},
         "filters": dict(chosen),
-        "real": metrics.to_json(scores),
+        "real": metrics.json_ready(scores),
     }
     return Part([headline, MEANING, MEANING_REAL], {"Real ground": table}, numbers, [out / "sites.txt", figure])
 

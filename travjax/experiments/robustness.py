@@ -17,7 +17,7 @@ from travjax.data.provenance import SitesConfig
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.evaluation.metrics import NAMES, OVERALL, Confusion, average_precision, confusions
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.inference import logits_of, probabilities
 from travjax.runs.predictor import Predictor
 from travjax.simulation.actions import ActionSpace
@@ -69,7 +69,7 @@ FILTERS: dict[str, Callable[[Maps], Maps]] = {
 
 
 @dataclass(frozen=True)
-class Ground:
+class BenchmarkMaps:
     """Clean maps and what the simulator says of them.
 
     heights: [n, rows, cols] metres, none unknown: what was unknown has the height of the nearest known node
@@ -94,24 +94,24 @@ class Ground:
         actions: ActionSpace,
         grid: Grid,
         on_progress: Progress = lambda count: None,
-    ) -> "Ground":
+    ) -> "BenchmarkMaps":
         """Maps of all styles, drawn as a data set of that size and seed draws them; on_progress: is told of maps."""
         config, batches = DatasetConfig(count, seed), []
         for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), grid):
             batches.append(labelled(batch, robot, actions, grid))
             on_progress(len(batch["heights"]))
-        return Ground._of(joined(batches), robot, actions, grid)
+        return BenchmarkMaps._from_batch(joined(batches), robot, actions, grid)
 
     @staticmethod
-    def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
+    def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
         """Windows of real maps; heights: NaN unknown."""
-        return Ground._of(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
+        return BenchmarkMaps._from_batch(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
 
     @staticmethod
-    def _of(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "Ground":
+    def _from_batch(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
         margins = np.stack([maps[event] for event in EVENTS], axis=-1)
         heights = sensor_noise.filled(maps["heights"])
-        return Ground(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
+        return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
 
     def seen(self, name: str, seed: int) -> Maps:
         """The maps with a corruption of CORRUPTIONS, the same each time."""
@@ -144,7 +144,7 @@ def of_sites(
     actions: ActionSpace,
     grid: Grid,
     on_progress: Progress = lambda count: None,
-) -> dict[str, Ground]:
+) -> dict[str, BenchmarkMaps]:
     """The windows of each site by its name: all that are known well enough, or `most` drawn at random.
 
     config: its splits and turns are left aside; on_progress: is told of windows that were read
@@ -156,7 +156,7 @@ def of_sites(
     for number, site in enumerate(config.site):
         own, rng = np.flatnonzero(data.group == site.group), np.random.default_rng((seed, number))
         chosen = np.sort(rng.choice(own, min(most, len(own)), replace=False))
-        grounds[site.group] = Ground.real(data.heights[chosen], robot, actions, grid)
+        grounds[site.group] = BenchmarkMaps.real(data.heights[chosen], robot, actions, grid)
     return grounds
 
 
@@ -168,7 +168,7 @@ def by_margins(margins: Float[np.ndarray, "n t 3"], robot: Robot) -> Fails:
 def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
     """Probabilities of an estimator for samples [k] of maps: [k, 3]; on_progress: is told of samples."""
     devices = Devices.all()
-    graph, variables = take_apart(predictor.network)
+    graph, variables = split_model(predictor.network)
     variables, source = devices.replicate(variables), devices.replicate(predictor.run.source(maps))
     return probabilities(logits_of(graph, variables, source, samples, devices, 64 * devices.mesh.size, on_progress))
 

@@ -14,7 +14,7 @@ from travjax.experiments.robustness import (
     CLEAN,
     CORRUPTIONS,
     FILTERS,
-    Ground,
+    BenchmarkMaps,
     Progress,
     average_precisions,
     by_margins,
@@ -47,15 +47,15 @@ SiteScores = dict[str, dict[str, dict[str, Confusion]]]
 """Of one site: by corruption, method and event."""
 
 
-def best_filters(validation: Ground, seed: int) -> dict[str, str]:
+def best_filters(validation: BenchmarkMaps, seed: int) -> dict[str, str]:
     """For every corruption the filter of FILTERS after which the simulator is best on the validation maps."""
     with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
         return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
 
 
 def compare(
-    test: Ground,
-    validation: Ground,
+    test: BenchmarkMaps,
+    validation: BenchmarkMaps,
     field: Predictor,
     resnet: Predictor | None,
     samples: int,
@@ -92,7 +92,7 @@ def _margins(margins: np.ndarray | None) -> np.ndarray:
     return margins
 
 
-def _drawn(test: Ground, samples: int, seed: int) -> Samples:
+def _drawn(test: BenchmarkMaps, samples: int, seed: int) -> Samples:
     """Random trajectories of all maps, for what is too slow for all of them."""
     rng = np.random.default_rng(seed)
     maps, trajectories = test.failed.shape[:2]
@@ -104,7 +104,7 @@ def _scored(fails: np.ndarray, failed: np.ndarray) -> dict:
     return {"confusion": scores(fails, failed), "average_precision": average_precisions(fails, failed)}
 
 
-def _on_clean_maps(test: Ground, validation: Ground, field: Predictor, predicted: Predicted) -> dict:
+def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predictor, predicted: Predicted) -> dict:
     """The threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
     probability = field.predict(validation.heights).probability
     threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
@@ -117,13 +117,13 @@ def _on_clean_maps(test: Ground, validation: Ground, field: Predictor, predicted
     }
 
 
-def on_sites(real: Mapping[str, Ground], field: Predictor, seed: int) -> dict[str, SiteScores]:
+def on_sites(real: Mapping[str, BenchmarkMaps], field: Predictor, seed: int) -> dict[str, SiteScores]:
     """For every site and corruption: the confusions of the simulator after each filter, and of the hazard field."""
     with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
         return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
 
 
-def _of_site(ground: Ground, field: Predictor, seed: int, on_progress: Progress) -> SiteScores:
+def _of_site(ground: BenchmarkMaps, field: Predictor, seed: int, on_progress: Progress) -> SiteScores:
     found: SiteScores = {}
     for name in CORRUPTIONS:
         seen, by_method = ground.seen(name, seed), {}

@@ -18,7 +18,7 @@ from travjax.devices import Devices
 from travjax.evaluation import map_figures, simulator_benchmark
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
-from travjax.files import find_preset, output_folder, written_whole
+from travjax.files import atomic_write, find_preset, output_folder
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.preset import Preset
 from travjax.simulation.actions import ActionSpace
@@ -148,7 +148,7 @@ def _write(rows: list[dict], headline: str, out: Path) -> None:
     """Prints the table, and writes it as TSV, a figure and the report."""
     table = rows_table(rows, COLUMNS)
     print(f"\n{headline}\n{table}\n")
-    with written_whole(out / "timing.tsv") as temporary:
+    with atomic_write(out / "timing.tsv") as temporary:
         simulator_benchmark.write_tsv(rows, temporary, COLUMNS)
     figure = map_figures.save(map_figures.timing_figure(rows), out / "timing.png")
     pieces: list[launch.Piece] = [f"{headline}.", launch.verbatim(table), MEANING, figure]

@@ -84,7 +84,7 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     if not arguments.synthetic:
         _train_synthetic(base, synthetic, devices)
     say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
-    _write(transfer, Results.of(run_all(transfer, say)), out)
+    _write(transfer, Results.from_rows(run_all(transfer, say)), out)
 
 
 def _require_same(out: Path, config) -> None:
@@ -210,7 +210,7 @@ def _maps_figure(transfer):
     from travjax.training.evaluator import Evaluator
 
     config, data, base = transfer.config, transfer.dataset, transfer.base
-    evaluator = Evaluator.of(base, data, transfer.devices)
+    evaluator = Evaluator.from_run(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)
     models = {"before": transfer.pretrained, "after": transfer.estimator(transfer.arms[-1], config.seeds[0])}
     predictions = {}

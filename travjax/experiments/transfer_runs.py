@@ -14,7 +14,7 @@ import numpy as np
 from flax import nnx
 
 from travjax.config import InputError, require
-from travjax.data.dataset import Dataset, require_same
+from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples, natural_sample
 from travjax.devices import Devices
 from travjax.files import output_folder, save_npz
@@ -99,7 +99,7 @@ class Transfer:
     ):
         self.config, self.base, self.synthetic, self.dataset = config, base, synthetic, dataset
         self.folder, self.devices = folder, devices
-        require_same(dataset, base.robot, base.actions, base.grid)
+        require_matching(dataset, base.robot, base.actions, base.grid)
         self.held_out = _held_out(dataset, config)
         if config.shown_maps:
             allowed = f"a held-out site, {', '.join(self.held_out)}, or shown_maps 0"
@@ -149,7 +149,7 @@ class Transfer:
     def _require_same(self, place: Path, run: Run) -> None:
         """A run that was begun goes on with what it began with, and so do its figures."""
         begun = Run.load(place)
-        begun.require_same(run, f"{place}")
+        begun.require_same_settings(run, f"{place}")
         first = begun.preset.weights
         require(first == run.preset.weights, f"{place}: weights", run.preset.weights, f"{first}, as in the run so far")
 

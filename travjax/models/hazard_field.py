@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from travjax.config import require, require_number
 from travjax.jax_flags import key_of, usual_flags
-from travjax.models.pose_stencil import PLACES, Stencil
+from travjax.models.pose_stencil import STENCIL_NODES, Stencil
 from travjax.resnet.convolution import convolve
 from travjax.resnet.network import ConvNorm
 from travjax.simulation.traverse import EVENTS
@@ -125,7 +125,7 @@ class PoseHead(nnx.Module):
     """The channels at a pose's stencil to its logits and margins."""
 
     def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
-        inputs, hidden, outputs = (PLACES + 1) * config.channels, config.hidden, 2 * len(EVENTS)
+        inputs, hidden, outputs = (STENCIL_NODES + 1) * config.channels, config.hidden, 2 * len(EVENTS)
         self.first = nnx.Linear(inputs, hidden, use_bias=False, kernel_init=_he_normal, rngs=rngs)
         self.bias = nnx.Param(jnp.zeros(hidden, jnp.float32))
         self.second = nnx.Linear(hidden, hidden, kernel_init=_he_normal, rngs=rngs)

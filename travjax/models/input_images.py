@@ -44,7 +44,7 @@ FORMAT = 1
 STRAIGHT = 1e6
 """Metres: radius that straight lines are drawn with; over 10 m they are 13 micrometres off."""
 
-CHUNK = 16
+TRAJECTORIES_AT_ONCE = 16
 """Arcs drawn at once: their distances fit in the second-level cache."""
 
 
@@ -108,7 +108,7 @@ class ImageSource:
     elevation_scale: float | np.float32
 
     @staticmethod
-    def of(
+    def from_maps(
         heights: Float[np.ndarray, "n rows cols"],
         robot: Robot,
         actions: ActionSpace,
@@ -214,8 +214,8 @@ def trajectory_channels(
     radii = np.asarray(actions.radii)
     along_first = arcs(starts[shared, 0], radii[first[shared]], actions.arc_lengths[0])
     channels = np.empty((len(turn), *grid.shape, 2), np.uint8)
-    for start in range(0, len(turn), CHUNK):
-        part = slice(start, start + CHUNK)
+    for start in range(0, len(turn), TRAJECTORIES_AT_ONCE):
+        part = slice(start, start + TRAJECTORIES_AT_ONCE)
         along_second = arcs(starts[part, 1], radii[second[part]], actions.arc_lengths[1])
         marks = np.maximum(along_first[place[part]], along_second)
         channels[part, ..., 0] = (marks[:, 0].astype(np.uint32) + 128) // 257
@@ -234,11 +234,11 @@ def _arc_marks(start, radius, length: float, *, robot: Robot, widths, grid: Grid
     reach = np.array([widths[0]] + [widths[1]] * 4, np.float32)
     paths = np.stack([_point_path(start, radius, length, *offset) for offset in offsets], axis=1).astype(np.float32)
     axis = grid.axis().astype(np.float32)
-    for begin in range(0, len(start), CHUNK):
-        chunk = paths[begin : begin + CHUNK]
-        missing = CHUNK - len(chunk)
+    for begin in range(0, len(start), TRAJECTORIES_AT_ONCE):
+        chunk = paths[begin : begin + TRAJECTORIES_AT_ONCE]
+        missing = TRAJECTORIES_AT_ONCE - len(chunk)
         padded = np.concatenate([chunk, np.repeat(chunk[:1], missing, axis=0)]) if missing else chunk
-        marks[begin : begin + CHUNK] = _marks(padded, reach, axis)[: len(chunk)]
+        marks[begin : begin + TRAJECTORIES_AT_ONCE] = _marks(padded, reach, axis)[: len(chunk)]
     return marks
 
 

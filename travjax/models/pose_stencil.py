@@ -19,7 +19,7 @@ from travjax.simulation.robot import Robot
 ACROSS, ALONG = 2, 5
 """Places under the chassis, evenly spread over its width and length."""
 
-PLACES = 8 + ACROSS * ALONG
+STENCIL_NODES = 8 + ACROSS * ALONG
 """Of a stencil: the wheels FL, FR, RL, RR, the same one interval before, and those under the chassis."""
 
 Nodes = Int[np.ndarray, "*p s"]
@@ -52,7 +52,7 @@ def stencil(robot: Robot, actions: ActionSpace, grid: Grid) -> Stencil:
     following = actions.second_poses(turn[:, None], first[:, None], every)
     parts = [nodes_at(own, radii[first][:, None], robot, actions, grid)]
     parts.append(nodes_at(following, radii[:, None], robot, actions, grid))
-    nodes = np.concatenate([part.reshape(len(turn), -1, PLACES) for part in parts], axis=1)
+    nodes = np.concatenate([part.reshape(len(turn), -1, STENCIL_NODES) for part in parts], axis=1)
     nodes.setflags(write=False)
     return Stencil(nodes, own.shape[1], len(radii))
 

@@ -111,7 +111,7 @@ def create(
     return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(key_of(seed + 1))))
 
 
-def take_apart(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:
+def split_model(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:
     """What is fixed of an estimator, and its VARIABLES."""
     graph, *states = nnx.split(
         estimator,
@@ -122,6 +122,6 @@ def take_apart(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State
     return graph, dict(zip(VARIABLES, states, strict=True))
 
 
-def put_together(graph: nnx.GraphDef, variables: dict[str, nnx.State]) -> Any:
-    """The inverse of `take_apart`; the estimator has variables of its own."""
+def merge_model(graph: nnx.GraphDef, variables: dict[str, nnx.State]) -> Any:
+    """The inverse of `split_model`; the estimator has variables of its own."""
     return nnx.merge(graph, *(variables[name] for name in VARIABLES), copy=True)

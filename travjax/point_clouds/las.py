@@ -16,7 +16,7 @@ from travjax.point_clouds.laz import require_decompressible, without_panics
 from travjax.point_clouds.points import COARSEST_STEP, Points, installed, reason_of
 from travjax.rasters.reading_options import DemOptions
 
-CHUNK = 2_000_000
+POINTS_AT_ONCE = 2_000_000
 """Points in memory with all that they hold."""
 
 POINT_BYTES = (20, 28, 26, 34, 57, 63, 30, 36, 38, 59, 67)
@@ -56,7 +56,7 @@ def read_las(path: Path, options: DemOptions) -> Points:
     form = "LAZ" if header.compressed else "LAS"
     try:
         with without_panics(), laspy.open(path, read_evlrs=False) as points:
-            for chunk in points.chunk_iterator(CHUNK) if header.points else ():
+            for chunk in points.chunk_iterator(POINTS_AT_ONCE) if header.points else ():
                 read += len(chunk)
                 parts.append(_kept(chunk))
     except (MemoryError, KeyboardInterrupt, SystemExit):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError
-from travjax.files import written_whole
+from travjax.files import atomic_write
 from travjax.resnet.keras_files import open_hdf5, open_keras
 from travjax.resnet.stored_arrays import Stored, WeightFile, open_zip, reading, shown, stored_npy
 
@@ -78,7 +78,7 @@ def write_safetensors(path: Path, arrays: dict[str, np.ndarray], notes: dict) ->
         require_finite(f"{path}: {name}", array)
     sums = {NOTES: _sum_of_notes(notes)} | {name: _sum_of(array) for name, array in arrays.items()}
     header = {"travjax": json.dumps(notes | {SUMS: sums})}  # one entry: safetensors writes several in any order
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_bytes(save(arrays, metadata=header))  # save_file hides it from others
 
 

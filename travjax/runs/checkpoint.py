@@ -261,7 +261,7 @@ def _described(leaves: dict[str, Any]) -> dict[str, list]:
 def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
     leaves = {} if template is None else _named_leaves(template)
     if template is not None:
-        _require_same(path, saved, _described(leaves))
+        _require_same_arrays(path, saved, _described(leaves))
     abstract = {}
     for name, (dtype, shape) in saved.items():
         sharding = getattr(leaves.get(name), "sharding", None)
@@ -280,7 +280,7 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in leaves])
 
 
-def _require_same(path: Path, saved: dict[str, list], wanted: dict[str, list]) -> None:
+def _require_same_arrays(path: Path, saved: dict[str, list], wanted: dict[str, list]) -> None:
     """Raises InputError that names the first arrays of a checkpoint that are not those wanted."""
     shown = lambda array: "{}{}".format(*array) if array else "missing"
     names = [name for name in {**wanted, **saved} if saved.get(name) != wanted.get(name)]

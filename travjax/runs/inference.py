@@ -14,7 +14,7 @@ from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.jax_flags import usual_flags
 from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import put_together
+from travjax.models.trajectory_resnet import merge_model
 from travjax.runs.map_samples import MapSource
 
 Variables = dict[str, nnx.State]
@@ -33,19 +33,19 @@ class NoNumbers(InputError):
 @partial(jax.jit, static_argnames="graph")
 def sample_logits(graph, variables: Variables, source: ImageSource, map_index, trajectory_index):
     """Logits of samples [b]: [b, 3]."""
-    return put_together(graph, variables)(source.images(map_index, trajectory_index))
+    return merge_model(graph, variables)(source.images(map_index, trajectory_index))
 
 
 @partial(jax.jit, static_argnames="graph")
 def sample_features(graph, variables: Variables, source: ImageSource, map_index, trajectory_index):
     """The trunk's features of samples [b]: [b, features]."""
-    return put_together(graph, variables).trunk(source.images(map_index, trajectory_index))[0]
+    return merge_model(graph, variables).trunk(source.images(map_index, trajectory_index))[0]
 
 
 @partial(jax.jit, static_argnames="graph")
 def feature_logits(graph, variables: Variables, features: Float[Array, "b f"]):
     """Logits of features of the trunk: [b, 3]."""
-    return put_together(graph, variables).heads(features)
+    return merge_model(graph, variables).heads(features)
 
 
 @usual_flags()
@@ -93,7 +93,7 @@ def over_samples(
 @partial(jax.jit, static_argnames="graph")
 def map_hazards(graph, variables: Variables, source: MapSource, map_index):
     """Logits, then margins in units of the limits, of all trajectories of maps [b]: [b, t, 6]."""
-    return jnp.concatenate(put_together(graph, variables)(source.elevation(map_index), source.stencil), axis=-1)
+    return jnp.concatenate(merge_model(graph, variables)(source.elevation(map_index), source.stencil), axis=-1)
 
 
 def logits_of(

@@ -41,7 +41,9 @@ class MapSource:
     elevation_scale: float | np.float32
 
     @staticmethod
-    def of(heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float) -> "MapSource":
+    def from_maps(
+        heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float
+    ) -> "MapSource":
         """heights: [n, rows, cols] metres; an unknown node gets the height of the nearest known one."""
         return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
 

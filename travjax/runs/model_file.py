@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import put_together, take_apart
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.resnet.stored_arrays import WeightFile, shown
 from travjax.resnet.weight_files import open_arrays, require_finite, write_safetensors
 from travjax.runs.run import Network, Run, named_leaves
@@ -23,7 +23,7 @@ def write_model(path: Path, run: Run, network: Network, notes: dict) -> None:
 
     Raises InputError that names an array of which a number is not finite.
     """
-    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(take_apart(network)[1]).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(split_model(network)[1]).items()}
     write_safetensors(path, arrays, {"run": run.to_json(), "notes": notes})
 
 
@@ -43,7 +43,7 @@ def read_model(path: Path) -> tuple[Run, Network, dict]:
     if not file.checked:
         print(f"{path}: has no checksums, as it is of an older travjax: damage would go unnoticed; export it again")
     variables = jax.tree.unflatten(jax.tree.structure(template), [jax.numpy.asarray(array) for array in arrays])
-    return run, put_together(run.graph(), variables), notes
+    return run, merge_model(run.graph(), variables), notes
 
 
 def _described(notes: dict) -> tuple[Run, dict]:

@@ -12,7 +12,7 @@ from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.files import user_path
 from travjax.jax_flags import usual_flags
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.inference import NoNumbers, hazards, logits_of, probabilities
 from travjax.runs.map_samples import MapSource
 from travjax.runs.model_file import SUFFIX, read_model
@@ -71,7 +71,9 @@ class Predictor:
             raise InputError(f"{path}: no estimator; allowed: the folder of a training run, or a {SUFFIX} file")
         return Predictor(*read_model(path)[:2], path)
 
-    def require_same(self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None):
+    def require_trained_for(
+        self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None
+    ):
         """Raises InputError that names both when something else is given than the estimator was trained for."""
         run = self.run
         if robot:
@@ -102,7 +104,7 @@ class Predictor:
 
     def _outputs(self, maps: np.ndarray, on_progress: Callable[[int], object]) -> tuple[np.ndarray, np.ndarray | None]:
         """Logits and margins of the trajectories of maps: [n, t, 3] each, no margins of an estimator without any."""
-        graph, variables = take_apart(self.network)
+        graph, variables = split_model(self.network)
         devices = Devices.all()
         variables, source = devices.replicate(variables), devices.replicate(self.run.source(maps))
         every, trajectories = np.arange(len(maps)), len(self.run.actions)

@@ -20,7 +20,7 @@ from travjax.jax_flags import usual_flags
 from travjax.models.hazard_field import HazardField
 from travjax.models.input_images import ImageSource
 from travjax.models.names import FIELD
-from travjax.models.trajectory_resnet import VARIABLES, Estimator, put_together, take_apart
+from travjax.models.trajectory_resnet import VARIABLES, Estimator, merge_model, split_model
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.weight_files import require_finite
 from travjax.runs.checkpoint import Checkpoints
@@ -81,7 +81,7 @@ class Run:
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
-    def require_same(self, other: "Run", what: str) -> None:
+    def require_same_settings(self, other: "Run", what: str) -> None:
         """Raises InputError that names the first setting in which the other run differs."""
         free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.each")}
         for name, mine, others in _settings(self, other):
@@ -105,20 +105,20 @@ class Run:
         """Maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
         scale = self.preset.elevation_scale
         if self.preset.model == FIELD:
-            return MapSource.of(heights, self.robot, self.actions, self.grid, scale)
-        return ImageSource.of(heights, self.robot, self.actions, self.grid, scale, on_progress)
+            return MapSource.from_maps(heights, self.robot, self.actions, self.grid, scale)
+        return ImageSource.from_maps(heights, self.robot, self.actions, self.grid, scale, on_progress)
 
     @usual_flags()
     def graph(self) -> nnx.GraphDef:
         """What is fixed of the estimator."""
-        return take_apart(nnx.eval_shape(self.create))[0]
+        return split_model(nnx.eval_shape(self.create))[0]
 
     @usual_flags()
     def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
         """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
 
         def state():
-            variables = take_apart(self.create())[1]
+            variables = split_model(self.create())[1]
             if phase:
                 trained = {name: variables[name] for name in TRAINED[phase]}
                 variables |= {"optimizer": self.preset.training.optimizer(phase, 1).init(trained)}
@@ -162,7 +162,7 @@ def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict
             trained = Run.from_json(meta["run"])
         except InputError as error:
             raise InputError(f"{where}: run: {error}") from None
-        trained.require_same(run, f"{user_path(folder) / 'run.json'}")
+        trained.require_same_settings(run, f"{user_path(folder) / 'run.json'}")
     return meta
 
 
@@ -182,7 +182,7 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     variables = {name: state[name] for name in VARIABLES}
     for name, leaf in named_leaves(variables).items():
         require_finite(f"{folder}, checkpoint {which}: {name}", np.asarray(leaf))
-    return run, put_together(run.graph(), state), meta
+    return run, merge_model(run.graph(), state), meta
 
 
 def named_leaves(variables: Any) -> dict[str, Any]:

@@ -40,7 +40,7 @@ class Margins:
     known: np.ndarray
 
 
-UNKNOWN = TrajectoryMargins(step=math.nan, obstacle=math.nan, tilt=math.nan, known=False)
+UNKNOWN_MARGINS = TrajectoryMargins(step=math.nan, obstacle=math.nan, tilt=math.nan, known=False)
 
 
 def poses(actions, trajectory: int) -> np.ndarray:
@@ -101,7 +101,7 @@ def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: flo
         plane = _pose_plane(contacts, robot)
         clearance = _highest_above_plane(heights, robot, plane, x, y, heading, cell_size)
         if math.isnan(sum(contacts)) or math.isnan(clearance):
-            return UNKNOWN
+            return UNKNOWN_MARGINS
         if previous is not None:
             step = max(step, *(abs(now - before) for now, before in zip(contacts, previous, strict=True)))
         obstacle = max(obstacle, clearance)

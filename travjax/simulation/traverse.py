@@ -31,13 +31,13 @@ EVENTS = ("step", "obstacle", "tilt")
 FEW_MAPS = 2
 """Up to this many maps, RUN neighbouring nodes are read at once: the lanes alone would not fill a vector register."""
 
-CHUNK = 200_000
+POSES_AT_ONCE = 200_000
 """Poses times lanes that a CPU simulates at once: a float32 array of them fits in the second-level cache of a core."""
 
-PLACES = 8
+NODES_AT_ONCE = 8
 """Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
 
-UNKNOWN = 1e30
+UNKNOWN_HEIGHT = 1e30
 """Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
 
 
@@ -180,7 +180,7 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
     runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
     arcs = len(table.centre)
     if jax.default_backend() == "cpu":
-        arcs = min(arcs, max(1, round(CHUNK / (maps * len(table.layout.views) * table.layout.poses))))
+        arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
     padding = -len(table.centre) % arcs
 
     def cut(array):
@@ -200,9 +200,9 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
-    """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near PLACES."""
+    """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near NODES_AT_ONCE."""
     chunks, poses, _, count = places.shape
-    steps = -(-count // PLACES)
+    steps = -(-count // NODES_AT_ONCE)
     places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
     each = places.shape[-1] // max(steps, 1)
     return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
@@ -212,7 +212,7 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
 def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -> Margins:
     grid = layout.grid
     centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
-    heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN)
+    heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN_HEIGHT)
     # Without these barriers XLA computes both anew for every element that is gathered from them.
     by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)
     views = jax.lax.optimization_barrier(_view_lanes(by_node, layout.views, grid))
@@ -225,7 +225,7 @@ def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -
 
     maxima = jax.lax.map(simulate_chunk, chunks).transpose(1, 0, 2, 3, 4).reshape(4, -1, len(maps))
     step, slope, obstacle, contact = maxima[:, source].transpose(0, 2, 1)
-    known = (contact < UNKNOWN / 2) & (obstacle < UNKNOWN / 2)
+    known = (contact < UNKNOWN_HEIGHT / 2) & (obstacle < UNKNOWN_HEIGHT / 2)
     tilt = jnp.arctan(jnp.sqrt(slope))
     step, obstacle, tilt = (jnp.where(known, margin, jnp.nan) for margin in (step, obstacle, tilt))
     return Margins(step, obstacle, tilt, known)
@@ -298,7 +298,7 @@ def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> 
             highest = _larger(above, highest)
         return highest, None
 
-    return jax.lax.scan(step, jnp.full_like(level, -UNKNOWN), places)[0]
+    return jax.lax.scan(step, jnp.full_like(level, -UNKNOWN_HEIGHT), places)[0]
 
 
 def _arc_maxima(contact: jax.Array, slope: jax.Array, obstacle: jax.Array, layout: Layout) -> jax.Array:

@@ -9,14 +9,14 @@ import numpy as np
 
 from travjax.config import require
 from travjax.data import map_batches
-from travjax.data.dataset import Dataset, require_same
+from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples, balanced_subset, every_sample, natural_sample
 from travjax.devices import Devices
 from travjax.evaluation import metrics
 from travjax.evaluation.baselines import LogisticRegression, slope_and_step
 from travjax.models.hazard_field import HazardField
 from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import take_apart
+from travjax.models.trajectory_resnet import split_model
 from travjax.runs.inference import hazards, logits_of, probabilities
 from travjax.runs.map_samples import MapSource
 from travjax.runs.run import Network, Run
@@ -46,9 +46,9 @@ class Evaluator:
     devices: Devices
 
     @staticmethod
-    def of(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
+    def from_run(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
         """Puts the images' parts on the devices."""
-        require_same(dataset, run.robot, run.actions, run.grid)
+        require_matching(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
         source = run.source(dataset.heights)
         return Evaluator(run, dataset, devices.replicate(source), devices)
@@ -75,7 +75,7 @@ class Evaluator:
         self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
         """Of samples: [k, 3]."""
-        graph, variables = take_apart(estimator)
+        graph, variables = split_model(estimator)
         variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
         logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
         return probabilities(logits)
@@ -88,7 +88,7 @@ class Evaluator:
         Both are cut off where training does not tell them apart any more. on_progress: is told of maps
         Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
         """
-        graph, variables = take_apart(network)
+        graph, variables = split_model(network)
         maps, place = np.unique(samples[0], return_inverse=True)
         source = cast(MapSource, self.source)
         found = hazards(graph, self.devices.replicate(variables), source, maps, self.devices, on_progress)

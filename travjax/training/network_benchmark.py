@@ -16,7 +16,7 @@ from travjax.data.dataset import DatasetConfig, generate
 from travjax.data.sampling import Sampler, batches
 from travjax.devices import Devices
 from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import VARIABLES, create, take_apart
+from travjax.models.trajectory_resnet import VARIABLES, create, split_model
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.inference import over_samples, sample_logits
 from travjax.runs.preset import TrainingConfig
@@ -52,8 +52,8 @@ class Bench:
     ):
         self.repeats, self.devices = repeats, Devices.all()
         self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
-        self.source = self.devices.replicate(ImageSource.of(self.dataset.heights, robot, actions, grid, 1.0))
-        self.graph, self.variables = take_apart(create(trunk))
+        self.source = self.devices.replicate(ImageSource.from_maps(self.dataset.heights, robot, actions, grid, 1.0))
+        self.graph, self.variables = split_model(create(trunk))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:

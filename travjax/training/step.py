@@ -16,7 +16,7 @@ from flax import nnx
 from travjax.jax_flags import key_of, usual_flags
 from travjax.models.hazard_field import HazardField
 from travjax.models.names import FIELD
-from travjax.models.trajectory_resnet import Estimator, put_together
+from travjax.models.trajectory_resnet import Estimator, merge_model
 from travjax.runs.run import TRAINED
 
 State = dict[str, Any]
@@ -65,7 +65,7 @@ def update(state: State, inputs, targets, weight, seed, step, *, graph, phase: i
     key = jax.random.fold_in(key_of(seed), step)
 
     def loss(parameters):
-        estimator = put_together(graph, state | parameters)
+        estimator = merge_model(graph, state | parameters)
         each = LOSS[phase](estimator, inputs, targets, key)
         mean = (each * weight).sum() / weight.sum()
         added = penalty * estimator.heads.squares() if penalty else 0.0

@@ -21,14 +21,14 @@ import optax
 
 from travjax import progress
 from travjax.config import InputError, one_line, require
-from travjax.data.dataset import Dataset, require_same
+from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.evaluation import metrics
 from travjax.files import held
 from travjax.jax_flags import usual_flags
 from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import VARIABLES, take_apart
+from travjax.models.trajectory_resnet import VARIABLES, split_model
 from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.inference import NoNumbers, feature_logits, features_of, logits_of, probabilities
 from travjax.runs.map_samples import MapSource
@@ -80,7 +80,7 @@ class Trainer:
         quiet: bool = False,
         watched: Mapping[str, Samples] | None = None,
     ):
-        require_same(dataset, run.robot, run.actions, run.grid)
+        require_matching(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
         self.run, self.folder, self.devices = run, folder, devices
         self.config = run.preset.training
@@ -113,7 +113,7 @@ class Trainer:
     @usual_flags()
     def start(self, estimator: Network) -> None:
         """Begins with an estimator, whose trunk phase 1 leaves as it is."""
-        variables = jax.tree.map(jax.numpy.copy, take_apart(estimator)[1])  # steps take the state's memory
+        variables = jax.tree.map(jax.numpy.copy, split_model(estimator)[1])  # steps take the state's memory
         self.state: State = self.devices.replicate(variables)
         self._begin(1 if self.config.head_epochs else 2)
 
@@ -273,8 +273,8 @@ class Trainer:
         return {
             "validation_loss": float(optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1).mean()),
             "constant_loss": constant,
-            "average_precision": metrics.to_json(scores.average_precision),
-            "f1": metrics.to_json(scores.f1),
+            "average_precision": metrics.json_ready(scores.average_precision),
+            "f1": metrics.json_ready(scores.f1),
         }
 
     def _watched(self) -> dict[str, Any]:
@@ -282,7 +282,7 @@ class Trainer:
         names = [name for name in self.scored if name != "validation"]
         failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
         scores = {name: metrics.evaluate(probabilities(self._logits(name)), failed[name]).scores for name in names}
-        return {"watched": metrics.to_json(scores)} if names else {}
+        return {"watched": metrics.json_ready(scores)} if names else {}
 
     def _logits(self, name: str) -> np.ndarray:
         """Of the samples of that name, by the present state: [k, 3]."""
