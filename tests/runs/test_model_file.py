@@ -58,7 +58,7 @@ def test_a_hazard_field_comes_back_bit_for_bit(file):
 
 
 def test_a_resnet_comes_back_bit_for_bit(tmp_path):
-    path, made = tmp_path / "resnet.safetensors", training.estimator()
+    path, made = tmp_path / "resnet.safetensors", small_training.estimator()
     write_model(path, run_of(), made, {})
     run, network, notes = read_model(path)
     assert (run, notes) == (run_of(), {})

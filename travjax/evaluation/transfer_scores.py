@@ -103,6 +103,7 @@ class Results:
 
     arms: dict[str, dict[int, ArmRun]]
 
+    @staticmethod
     def from_rows(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
         """From the rows of every arm and seed."""
         run = lambda part: ArmRun(tuple(Epoch.from_row(row) for row in part))
