@@ -10,6 +10,7 @@ import pytest
 from safetensors import safe_open
 from safetensors.numpy import load_file, save, save_file
 
+from tests import small_training
 from tests.field_runs import RUN, estimator
 from tests.small_training import host, require_equal, run_of
 from travjax.config import InputError
