@@ -142,7 +142,7 @@ def read_text(path: Path, allowed: str = "") -> str:
 
 
 def _parsed(where: object, text: str, parse: Callable[[str], Any], kind: str, finite: bool) -> Any:
-    """What a parser makes of a text, once it is known to hold nothing that no file of ours holds."""
+    """Parses a text, once it is known to hold nothing that no file of ours holds."""
     try:
         found = parse(text)
     except RecursionError:
@@ -180,7 +180,9 @@ def _require_plain(found: object, finite: bool) -> None:
 
 
 def to_json(config: object) -> dict[str, Any]:
-    """A configuration dataclass as JSON can hold it: tuples are lists, and an infinite number in one is "inf"."""
+    """Converts a configuration dataclass to what JSON can hold: tuples become lists, and infinite numbers in them
+    "inf".
+    """
 
     def plain(value):
         if dataclasses.is_dataclass(value):
@@ -194,7 +196,9 @@ def to_json(config: object) -> dict[str, Any]:
 
 
 def from_json(table: Any, kind: type[Config]) -> Config:
-    """The configuration that `to_json` was given; raises InputError for unknown or missing keys and refused values."""
+    """Restores the configuration that `to_json` was given; raises InputError for unknown or missing keys and bad
+    values.
+    """
     require(isinstance(table, dict), kind.__name__, table, "a table")
     infinite = {"inf": math.inf, "-inf": -math.inf}
     number = lambda item: infinite.get(item, item) if isinstance(item, str) else item
@@ -211,7 +215,7 @@ def parts_from_json(table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
 
 
 def _made(table: dict, kind: type[Config]) -> Config:
-    """The configuration of a table; an angle that was given in degrees is named and shown as it was given."""
+    """Makes the configuration of a table; errors name and show an angle that was given in degrees as it was given."""
     try:
         return kind(**_fields_from(table, kind))
     except InputError as error:
@@ -250,7 +254,9 @@ def _fields_from(table: dict, kind: type) -> dict:
 
 
 def _unknown(key: str, names: dict[str, dataclasses.Field]) -> str:
-    """What is wrong with a key that is no field: the field it may be meant for, and all fields as they are written."""
+    """Says what is wrong with a key that is no field: the field it may be meant for, and all fields as they are
+    written.
+    """
     written = [(name, f"{name}_deg") if field.metadata.get("angle") else (name,) for name, field in names.items()]
     allowed = [form for forms in written for form in forms]
     near = difflib.get_close_matches(key, allowed, n=1)
@@ -259,7 +265,7 @@ def _unknown(key: str, names: dict[str, dataclasses.Field]) -> str:
 
 
 def _inner(key: str, table: object, kind: type, written: str, place: str) -> object:
-    """The configuration of a table within a table; `place` names it in errors."""
+    """Makes the configuration of a table within a table; `place` names it in errors."""
     require(isinstance(table, dict), key, table, f"a table {written}")
     try:
         return _made(table, kind)  # type: ignore[arg-type]

@@ -29,7 +29,7 @@ class Devices:
 
     @staticmethod
     def all() -> "Devices":
-        """Those that JAX sees; after `join`, those of all processes."""
+        """Returns the devices that JAX sees; after `join`, those of all processes."""
         return Devices(jax.make_mesh((jax.device_count(),), ("batch",), axis_types=(AxisType.Auto,)))
 
     @property
@@ -55,13 +55,13 @@ class Devices:
         return jax.tree.map(lambda array: _placed(array, self._in_parts), tree)
 
     def fetch(self, array: jax.Array) -> np.ndarray:
-        """A whole array, in each process."""
+        """Returns a whole array, in each process."""
         if array.is_fully_addressable:
             return np.asarray(array)
         return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
     def wait(self) -> None:
-        """Until all processes have come here."""
+        """Waits until all processes have come here."""
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices("travjax")
 

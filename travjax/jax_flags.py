@@ -40,6 +40,6 @@ def usual_flags() -> Iterator[None]:
 
 
 def key_of(seed) -> Key[Array, ""]:
-    """The random key of a seed from 0 to 2^32 - 1, whatever generator and offset of seeds are set."""
+    """Returns the random key of a seed from 0 to 2^32 - 1, whatever generator and offset of seeds are set."""
     words = jnp.stack([jnp.zeros((), jnp.uint32), jnp.asarray(seed, jnp.uint32)])
     return jax.random.wrap_key_data(words, impl=GENERATOR)

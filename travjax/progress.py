@@ -14,7 +14,7 @@ LONGEST_PATH = 5000
 
 
 def bar(what: str, total: float | None, unit: str, quiet: bool = False, **options: Any) -> Bar:
-    """A bar on standard error, if that is a terminal: a log file has no use for one that is drawn over and over."""
+    """Makes a progress bar on standard error if that is a terminal: in a log file each update would be a new line."""
     watched = sys.stderr is not None and sys.stderr.isatty()
     return tqdm(desc=what, total=total, unit=unit, disable=quiet or not watched, **options)
 

@@ -44,13 +44,13 @@ def going_on(how: str) -> Iterator[None]:
 
 
 def ending(error: KeyboardInterrupt) -> tuple[int, str]:
-    """The exit code of a program that a signal ended, and its line: the error's notes say how it goes on."""
+    """Returns the exit code of a program that a signal ended, and its line: the error's notes say how to go on."""
     number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
     return 128 + number, "; ".join([ENDINGS[number], *getattr(error, "__notes__", [])])
 
 
 def _heeded() -> list[signal.Signals]:
-    """Those that whoever started the program has not told it to ignore, as nohup and a shell's & do."""
+    """Returns the signals that whoever started the program has not set to be ignored, as nohup and a shell's & do."""
     if threading.current_thread() is not threading.main_thread():
         return []
     return [number for number in ENDINGS if signal.getsignal(number) not in (signal.SIG_IGN, None)]

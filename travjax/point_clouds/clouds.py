@@ -93,7 +93,9 @@ def _of_points(points: Points, options: DemOptions, grid: Grid) -> Raster:
 
 
 def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:
-    """The highest surface above nodes at the grid's spacing, or at the cell size given, from the mesh's own corner."""
+    """Samples the highest surface of a mesh at the grid's spacing, or at the given cell size, from the mesh's own
+    corner.
+    """
     if options.classes is not None:
         raise InputError(f"classes = {options.classes}: must be left out: a mesh has none")
     mesh = read_mesh(path)
@@ -119,7 +121,9 @@ def _of_mesh(path: Path, options: DemOptions, grid: Grid) -> Raster:
 
 
 def _in_metres(points: Points, up: str | None, options: DemOptions) -> tuple[np.ndarray, ...]:
-    """x to the east, y to the north and z up [n] in float64, and which have a height; refuses too large steps."""
+    """Returns x to the east, y to the north and z up, [n] float64, and which points have a height; refuses coarse
+    steps.
+    """
     east, north, height = (points.x, points.z, points.y) if up == "y" else (points.x, points.y, points.z)
     scale = options.height_scale or 1.0
     with np.errstate(invalid="ignore"):  # of a NaN that signals, in damaged files
@@ -151,7 +155,7 @@ def _require_site(x: np.ndarray, y: np.ndarray, z: np.ndarray, grid: Grid) -> No
 
 
 def _lies_along_z(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> bool:
-    """Whether points lie on a surface over x and z rather than over x and y, as where y points up."""
+    """Tells whether points lie on a surface over x and z rather than over x and y, as where y points up."""
     some = slice(None, None, max(1, len(x) // 20_000))
     x, y, z = x[some], y[some], z[some]
     across, along, high = (float(np.subtract(*np.quantile(values, (0.99, 0.01)))) for values in (x, y, z))
@@ -164,7 +168,7 @@ def _lies_along_z(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> bool:
 
 
 def _spread(one: np.ndarray, other: np.ndarray, height: np.ndarray, edge: float) -> float:
-    """Standard deviation of the heights in square cells."""
+    """Returns the standard deviation of the heights within square cells."""
     cells = np.floor(np.stack([one, other], axis=1) / edge).astype(np.int64)
     _, cell = np.unique(cells, axis=0, return_inverse=True)
     held = np.bincount(cell.ravel())

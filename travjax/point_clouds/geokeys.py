@@ -58,7 +58,7 @@ def system_of(records: dict[int, bytes], heights_scaled: bool) -> CRS | None:
 
 
 def _keys(directory: bytes, doubles: bytes) -> Keys:
-    """The keys that are numbers, by number."""
+    """Reads the keys whose values are numbers, by key number."""
     numbers = struct.unpack(f"<{len(directory) // 2}H", directory[: len(directory) // 2 * 2])
     values = struct.unpack(f"<{len(doubles) // 8}d", doubles[: len(doubles) // 8 * 8])
     if len(numbers) < 4:
@@ -92,7 +92,7 @@ def _horizontal(keys: Keys) -> CRS | None:
 
 
 def _described(keys: Keys) -> CRS | None:
-    """The system of a projection that is described by its numbers, None of one that is not or of another method."""
+    """Builds the system of a projection from its parameters; None without parameters, or for another method."""
     method = METHODS.get(int(keys.get(METHOD, 0)))
     if method is None:
         return None
@@ -126,7 +126,7 @@ def _require_heights_in_metres(keys: Keys, heights_scaled: bool) -> None:
 
 
 def _unit_metres(keys: Keys, key: int, size: int | None) -> float | None:
-    """Metres of the unit that a key names, or None; one without a code is as long as the key `size` says."""
+    """Returns the metres of the unit that a key names, or None; a unit without a code has the length in the key `size`."""
     code = int(keys.get(key, 0))
     if code == 0:
         return None
@@ -140,6 +140,6 @@ def _unit_metres(keys: Keys, key: int, size: int | None) -> float | None:
 
 @lru_cache(maxsize=1)
 def _units() -> dict[int, tuple[float, str]]:
-    """(metres, name) of EPSG's units of length, by their code."""
+    """Returns (metres, name) of EPSG's units of length, by code."""
     units = get_units_map(auth_name="EPSG", category="linear", allow_deprecated=True)
     return {int(unit.code): (unit.conv_factor, unit.name) for unit in units.values()}

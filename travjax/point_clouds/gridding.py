@@ -95,7 +95,7 @@ def _require_dense(points: int, cells: float, cell_size: float) -> None:
 
 
 def _fewest(cell_size: float, grid: Grid) -> int:
-    """How many points a window needs."""
+    """Returns how many points a window needs."""
     return int(grid.size / max(cell_size, COARSEST)) ** 2
 
 
@@ -111,7 +111,7 @@ def _repeated(x, y, z, grid: Grid, notes: list[str]):
 
 
 def _at_the_origin(x, y, z, grid: Grid, notes: list[str]):
-    """Without a point at exactly (0, 0, 0), the mark of an invalid return, where no ground nearby is as high."""
+    """Drops points at exactly (0, 0, 0), the mark of an invalid return, unless ground nearby is as high."""
     zero = (x == 0) & (y == 0) & (z == 0)
     if not zero.any():
         return x, y, z
@@ -123,7 +123,7 @@ def _at_the_origin(x, y, z, grid: Grid, notes: list[str]):
 
 
 def _apart(x, y, z, grid: Grid, notes: list[str]):
-    """Without the few points that a strip wider than a window, in which there are none, parts from all others.
+    """Drops the few points that an empty strip wider than a window separates from all others.
 
     They are too few for a window of their own, and would stretch the site over what nobody has measured.
     """
@@ -157,7 +157,7 @@ def _apart(x, y, z, grid: Grid, notes: list[str]):
 
 
 def _is_filled(values: np.ndarray, width: float) -> bool:
-    """Whether each half of a width holds a value, so that no gap is as wide: quicker than to sort them."""
+    """Tells whether each half of a width holds a value, so that no gap is as wide: faster than sorting."""
     first, extent = values.min(), np.ptp(values)
     return extent < 1e5 * width and bool(np.bincount(((values - first) / (width / 2)).astype(np.int64)).all())
 
@@ -168,7 +168,9 @@ def _points(chosen: np.ndarray) -> str:
 
 
 def _point_spacing(x: np.ndarray, y: np.ndarray) -> float:
-    """Metres between points, were they spread evenly over the middle nine tenths of the site on each axis."""
+    """Returns the metres between points if they were spread evenly over the middle nine tenths of the site on each
+    axis.
+    """
     across, along = (np.subtract(*np.quantile(values, (0.95, 0.05))) for values in (x, y))
     return float(np.sqrt(across * along / len(x)))
 
@@ -177,7 +179,7 @@ def _point_spacing(x: np.ndarray, y: np.ndarray) -> float:
 
 
 def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, axes: list[Scale], notes: list[str]) -> Raster | None:
-    """The raster that the bulk of the points is, if enough nodes have a neighbour one step east; None of other points.
+    """Returns the raster that the bulk of the points forms if enough nodes have a neighbour one step east, else None.
 
     Points off the nodes are left out, several heights of a node averaged.
     """
@@ -209,7 +211,7 @@ def _lattice(x: np.ndarray, y: np.ndarray, z: np.ndarray, axes: list[Scale], not
 
 
 def _at_nodes(place: np.ndarray, z: np.ndarray, nodes: int) -> tuple[np.ndarray, int]:
-    """(mean height at each place, NaN without one [nodes]; number of places with several)."""
+    """Returns (mean height at each node, NaN where there is none [nodes]; number of nodes with several heights)."""
     heights = np.full(nodes, np.nan)
     heights[place] = z
     several = np.unique(place[heights[place] != z])
@@ -221,14 +223,14 @@ def _at_nodes(place: np.ndarray, z: np.ndarray, nodes: int) -> tuple[np.ndarray,
 
 
 def _several_by_chance(filled: float) -> float:
-    """Share of the cells with points that hold several, were points thrown at random until so many cells have some."""
+    """Returns the share of occupied cells with several points if points fell at random until so many cells had some."""
     filled = min(filled, 0.999)
     a_cell = -np.log1p(-filled)
     return float(1 - a_cell * (1 - filled) / filled)
 
 
 def _regular(values: np.ndarray) -> Scale:
-    """The regular scale that values stand on but for rounding, a few apart; a step of 0 of others.
+    """Finds the regular scale that all but a few values stand on, apart from rounding; the step is 0 if there is none.
 
     Of the steps that the rounding leaves room for, the one with the fewest digits.
     """
@@ -262,7 +264,7 @@ def _regular(values: np.ndarray) -> Scale:
 
 
 def _levels(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(values that differ, number of points at each), without those that far fewer points hold than most points' own.
+    """Returns (distinct values, number of points at each), without values that far fewer points share than is usual.
 
     Of values that are nearer than SAME_LEVEL, the most frequent.
     """
@@ -297,7 +299,7 @@ def _require_own_places(x: np.ndarray, y: np.ndarray, axes: list[Scale], cell_si
 
 
 def _cell_size(x: np.ndarray, y: np.ndarray, finest: float) -> float:
-    """Metres, whole millimetres above `finest`: cells that hold POINTS_A_CELL at the site's usual density.
+    """Returns the metres, in whole millimetres above `finest`, of cells that hold POINTS_A_CELL at the usual density.
 
     That is the median of blocks that would hold 16 points each if these were spread evenly. A twentieth of the points
     on each side does not count, so that a few astray have no say.
@@ -315,14 +317,16 @@ def _cell_size(x: np.ndarray, y: np.ndarray, finest: float) -> float:
 
 
 def _cells(values: np.ndarray, edge: float) -> tuple[np.ndarray, int]:
-    """(number of the cell that each value lies in [n], number of the first): cells around the multiples of the edge."""
+    """Returns (number of the cell that each value lies in [n], number of the first), with cells centred on multiples of
+    the edge.
+    """
     number = np.floor(values / edge + 0.5).astype(np.int64)
     first = int(number.min())
     return number - first, first
 
 
 def _averaged(x: np.ndarray, y: np.ndarray, z: np.ndarray, cell_size: float) -> Raster:
-    """The mean height of the points in each cell, NaN where there are none."""
+    """Averages the heights of the points in each cell; NaN where there are none."""
     (col, first_col), (row, first_row) = (_cells(values, cell_size) for values in (x, y))
     rows, cols = int(row.max()) + 1, int(col.max()) + 1
     place = row * cols + col

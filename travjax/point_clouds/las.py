@@ -73,7 +73,7 @@ def read_las(path: Path, options: DemOptions) -> Points:
 
 
 def _kept(chunk: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(coordinates [3, n], classes [n]) of the points that are not withheld."""
+    """Returns (coordinates [3, n], classes [n]) of the points that are not withheld."""
     kept = np.asarray(chunk.withheld) == 0
     return np.stack([np.asarray(chunk[axis])[kept] for axis in "xyz"]), np.asarray(chunk.classification)[kept]
 
@@ -111,7 +111,7 @@ def _header(file: BinaryIO, size: int) -> Header:
 
 
 def _records(file: BinaryIO, start: int, end: int, count: int, header: int) -> dict[int, bytes]:
-    """The first record of each number, of those about coordinate systems and LASzip, between two places."""
+    """Reads the first record of each number between two offsets, of those about coordinate systems and LASzip."""
     found: dict[int, bytes] = {}
     for number in range(count):
         described = b""

@@ -85,7 +85,7 @@ def require_decompressible(
 
 
 def _described(record: bytes, point_size: int) -> tuple[int, int, list[tuple[int, int]]]:
-    """(compressor, points in a chunk, kind and bytes of the items) of the record of LASzip."""
+    """Reads (compressor, points in a chunk, kind and bytes of the items) from the record of LASzip."""
     if len(record) < 34:
         raise InputError("cannot be read as LAZ: no record of LASzip describes its compression")
     compressor, count = struct.unpack("<H", record[:2])[0], struct.unpack("<H", record[32:34])[0]

@@ -84,7 +84,7 @@ def _kind(content: bytes, suffix: str) -> str:
 
 
 def _placed(scene: Any, node: Any) -> tuple[np.ndarray, np.ndarray]:
-    """(vertices where a node of the scene puts them, faces); no faces of points and lines."""
+    """Returns (vertices as a node of the scene places them, faces); points and lines have no faces."""
     transform, name = scene.graph[node]
     geometry = scene.geometry[name]
     vertices = np.asarray(geometry.vertices, np.float64)
@@ -125,7 +125,7 @@ def _require_whole(content: bytes, kind: str) -> None:
 
 
 def _tree(content: bytes, kind: str) -> tuple[dict[str, Any], bytes | None]:
-    """(the JSON, the binary part of a GLB file)."""
+    """Reads (the JSON, the binary part of a GLB file)."""
     if kind == "gltf":
         return json.loads(content.decode("utf-8-sig")), None
     size = int.from_bytes(content[12:16], "little")
@@ -139,7 +139,7 @@ def _tree(content: bytes, kind: str) -> tuple[dict[str, Any], bytes | None]:
 
 
 def _length(buffer: dict[str, Any], binary: bytes | None) -> int:
-    """Bytes that a buffer holds, which is the binary part of a GLB file or written into the JSON."""
+    """Returns the bytes that a buffer holds, which is the binary part of a GLB file or part of the JSON."""
     uri = buffer.get("uri")
     if uri is None:
         held = len(binary or b"")
@@ -205,7 +205,7 @@ def _planes(nodes: np.ndarray) -> np.ndarray:
 
 
 def _spans(nodes: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, ...]]:
-    """(triangle, row, first column, number of columns) of the nodes on triangles, about NODES_AT_ONCE at a time."""
+    """Yields (triangle, row, first column, number of columns) of the nodes on triangles, about NODES_AT_ONCE at a time."""
     first = np.maximum(np.ceil(nodes[:, 0, 1] - EDGE), 0).astype(np.int64)
     last = np.minimum(np.floor(nodes[:, 2, 1] + EDGE), shape[0] - 1).astype(np.int64)
     for some in _portions(np.maximum(last - first + 1, 0)):
@@ -224,7 +224,7 @@ def _spans(nodes: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarr
 
 
 def _crossing(one: np.ndarray, other: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Where edges [n, 3] cross a row, as columns; an edge along the row counts from its first corner."""
+    """Returns the columns where edges [n, 3] cross a row; an edge along the row counts from its first corner."""
     rise = other[:, 1] - one[:, 1]
     share = np.divide(at - one[:, 1], rise, out=np.zeros(len(at)), where=rise > 0)
     return one[:, 0] + np.clip(share, 0, 1) * (other[:, 0] - one[:, 0])

@@ -114,7 +114,7 @@ def _text(file: BinaryIO, layout: Layout, columns: list[int], left: int) -> np.n
 
 
 def _unfolded(file: BinaryIO, layout: Layout, columns: list[int], left: int) -> list[np.ndarray]:
-    """The columns of compressed data, which holds one field of all points after the other."""
+    """Unpacks the columns of compressed data, which hold one field of all points after the other."""
     sizes = np.fromfile(file, "<u4", 2)
     folded, size = (int(number) for number in sizes) if len(sizes) == 2 else (0, 0)
     wanted = layout.points * layout.dtype().itemsize

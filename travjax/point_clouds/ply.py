@@ -83,7 +83,7 @@ def read_ply(path: Path) -> Points:
 
 
 def _header(file: BinaryIO) -> tuple[str, list[Element]]:
-    """(order of bytes, "" of a text; elements) of the header; the file is then at its end."""
+    """Reads (byte order, "" for text; elements) from the header, and leaves the file at its end."""
     order: str | None = None
     elements: list[Element] = []
     for number in itertools.count():
@@ -118,7 +118,7 @@ def _header(file: BinaryIO) -> tuple[str, list[Element]]:
 
 
 def _wanted(vertex: Element) -> dict[str, int]:
-    """The numbers of the properties that are coordinates, and of classes where there are such."""
+    """Returns the numbers of the properties that are coordinates and, if there are any, classes."""
     names = [name if not length else "" for name, _, length in vertex.properties]
     found = {axis: names.index(name) for axis, known in COLUMNS.items() for name in known if name in names}
     if not {"x", "y", "z"} <= set(found):
@@ -163,7 +163,7 @@ def _pass_over(file: BinaryIO, order: str, element: Element) -> None:
 
 
 def _table(file: BinaryIO, order: str, element: Element) -> np.ndarray | None:
-    """All of an element in binary, None where its lists differ in length; the file is then anywhere."""
+    """Reads a whole binary element; None where its lists differ in length, and the file position is then undefined."""
     lengths: dict[int, int] = {}
     if element.lists() and element.count:
         start = file.tell()
@@ -196,7 +196,7 @@ def _left(file: BinaryIO) -> int:
 
 
 def _values(file: BinaryIO, order: str, vertex: Element, columns: dict[str, int]) -> dict[str, np.ndarray]:
-    """The columns of the vertices; of a text in double precision, whatever type it states."""
+    """Reads the columns of the vertices; those of a text in double precision, whatever type it states."""
     if order:
         table = _table(file, order, vertex)
         if table is None:

@@ -127,7 +127,7 @@ def _beginning(file: TextIO) -> Beginning:
 
 
 def _lines(file: Iterator[str], separator: str | None) -> Iterator[str]:
-    """Lines of numbers as NumPy reads them: without comments, exponents of Fortran, and commas for decimals."""
+    """Yields lines of numbers as NumPy reads them: without comments, Fortran exponents and decimal commas."""
     for line in file:
         if line.startswith(COMMENT):
             continue
@@ -144,7 +144,7 @@ def _lines(file: Iterator[str], separator: str | None) -> Iterator[str]:
 
 
 def _separator(line: str) -> str | None:
-    """What parts the columns of a line: a semicolon, a comma that is not decimal, else blanks (None)."""
+    """Returns what separates the columns of a line: a semicolon, a comma that is not decimal, else blanks (None)."""
     if ";" in line:
         return ";"
     if "," not in line:
@@ -155,12 +155,12 @@ def _separator(line: str) -> str | None:
 
 
 def _width(line: str, separator: str | None) -> int:
-    """Columns of a line of numbers, without empty ones behind the last separator."""
+    """Counts the columns of a line of numbers, without empty ones after the last separator."""
     return len(line.rstrip(f'{separator or ""} \t"').split(separator))
 
 
 def _fields(line: str) -> list[str]:
-    """The columns of a line, without quotes and case; tabs part names that hold blanks."""
+    """Splits a line into lower-case columns without quotes; tabs separate names that hold blanks."""
     line = line.strip().lstrip("#/%!").strip().lower()
     separator = _separator(line) or ("\t" if "\t" in line else None)
     if separator is None and '"' in line:
@@ -170,7 +170,7 @@ def _fields(line: str) -> list[str]:
 
 
 def _names(header: str, columns: int) -> list[str]:
-    """The names in a header, one a column; where these hold blanks, as many words each."""
+    """Returns the names in a header, one a column; names with blanks have equally many words each."""
     fields = _fields(header)
     while len(fields) > columns and not fields[-1]:
         fields.pop()
@@ -181,7 +181,7 @@ def _names(header: str, columns: int) -> list[str]:
 
 
 def _with_units_below(header: str, fields: list[str]) -> str:
-    """A header whose names carry the units that stand in the line below it; "" where these are none."""
+    """Joins the names of a header with the units in the line below it; returns "" if that line holds no units."""
     names = _fields(header)
     units = len(fields) == len(names) and all(_unit(f"z [{field}]") or field in DEGREES for field in fields)
     pairs = zip(names, fields, strict=False)
@@ -212,14 +212,14 @@ def _words(field: str) -> list[str]:
 
 
 def _is_header(fields: list[str]) -> bool:
-    """Whether these name the axes, or degrees: then a comment is a header."""
+    """Tells whether words name the axes, or degrees: a comment with such words is a header."""
     words = [set(_words(field)) for field in fields]
     named = [any(set(NAMES[axis]) & one for one in words) for axis in "xyz"]
     return len(fields) >= 3 and (all(named) or (named[2] and any(one & DEGREES for one in words)))
 
 
 def _columns(fields: list[str], columns: int, options: DemOptions) -> dict[str, int]:
-    """Where x, y and z stand, and classes where there are such."""
+    """Returns the columns of x, y, z and, if there is one, of the classes."""
     found = {axis: _column(fields, axis) for axis in NAMES}
     degrees = [field for field in fields if set(_words(field)) & DEGREES]
     if degrees and any(found[axis] is None or fields[found[axis]] in degrees for axis in "xy"):  # type: ignore[index]
@@ -243,7 +243,7 @@ def _columns(fields: list[str], columns: int, options: DemOptions) -> dict[str, 
 
 
 def _column(fields: list[str], axis: str) -> int | None:
-    """The column that is named by the surest word alone, else the only one with such a word among others."""
+    """Returns the column named by exactly the best word, else the only column whose name contains such a word."""
     bare = [re.sub(r"[\[(].*", "", field).strip() for field in fields]
     for name in NAMES[axis]:
         if bare.count(name) == 1:
@@ -260,7 +260,7 @@ def _column(fields: list[str], axis: str) -> int | None:
 
 
 def _unit(field: str) -> str | None:
-    """The unit that a name carries in brackets or as its last word, or None."""
+    """Returns the unit that a name carries in brackets or as its last word, or None."""
     bracketed = re.search(r"[\[(]([^\])]*)", field)
     candidates = [bracketed[1].strip()] if bracketed else []
     candidates += _words(field)[1:][-1:]

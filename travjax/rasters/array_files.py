@@ -96,7 +96,7 @@ def rasters_of(entries: Entries, options: DemOptions, names: list[str] | None = 
 
 
 def _systems(entries: Entries, each: int) -> list[str | None]:
-    """The coordinate system of all maps, or of each; none at all is an empty list."""
+    """Reads the coordinate system of all maps, or of each; returns an empty list where there is none."""
     crs = np.ravel(entries["crs"]) if "crs" in entries else np.zeros(0, "U1")
     if crs.dtype.kind not in "US" and crs.size:
         raise InputError(f"crs: {crs.dtype}: must be a text, or one for each map")
@@ -106,7 +106,7 @@ def _systems(entries: Entries, each: int) -> list[str | None]:
 
 
 def _numbers(value: np.ndarray, name: str, allowed: str, *shapes: tuple[int, ...]) -> np.ndarray:
-    """Finite numbers of one of the shapes; a single one counts as [1]."""
+    """Reads finite numbers of one of the shapes; a single one counts as [1]."""
     array = np.atleast_1d(value)
     fits = array.shape in shapes and is_real(array.dtype) and bool(np.isfinite(array).all())
     require(fits, name, value.tolist(), allowed)
@@ -118,7 +118,7 @@ def _numbers(value: np.ndarray, name: str, allowed: str, *shapes: tuple[int, ...
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """One line for whatever NumPy and zipfile raise on a file."""
+    """Turns whatever NumPy and zipfile raise on a file into one line."""
     try:
         yield
     except (InputError, FileNotFoundError, PermissionError):
@@ -134,7 +134,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """One array of an archive, after what it claims was compared with what is there."""
+    """Reads one array of an archive, once what it claims agrees with what is there."""
     described = archive.getinfo(name)
     if described.file_size > max(LARGE, UNFOLDED * described.compress_size):
         raise InputError(

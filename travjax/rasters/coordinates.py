@@ -128,7 +128,7 @@ def system_named(name: str | None) -> CRS | None:
 
 
 def is_local(name: str | None) -> bool:
-    """Whether a system, as it is named, says nothing about where on earth it lies."""
+    """Tells whether a system, as it is named, says nothing about where on earth it lies."""
     return name is None or name.startswith(("LOCAL_CS", "ENGCRS"))
 
 
@@ -204,7 +204,9 @@ def _require_true_to_scale(name: str, crs: CRS, x: float, y: float) -> None:
 
 
 def _from_own_origin(crs: CRS, x: float, y: float, longitude: float, latitude: float) -> bool:
-    """Whether coordinates count from an origin of the site's own, as after an offset was taken off: see NEAR_ORIGIN."""
+    """Tells whether coordinates count from an origin of the site's own, as after an offset was subtracted: see
+    NEAR_ORIGIN.
+    """
     if max(abs(x), abs(y)) > NEAR_ORIGIN:
         return False
     code = crs.to_authority(min_confidence=70)

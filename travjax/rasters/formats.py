@@ -98,7 +98,7 @@ def _is_grid(text: str) -> bool:
 
 
 def _has_numbers(text: str) -> bool:
-    """Whether one of the first lines begins with three numbers."""
+    """Tells whether one of the first lines begins with three numbers."""
     number = r"[-+]?[\d.,]+(?:[eEdD][-+]?\d+)?"
     lines = text.splitlines()[:50]
     return any(re.match(rf"\s*{number}[\s;,]+{number}[\s;,]+{number}", line) for line in lines)

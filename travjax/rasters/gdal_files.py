@@ -46,7 +46,7 @@ CACHE_MIB = 256
 
 
 def read_raster(path: Path, options: DemOptions) -> Raster:
-    """One band of a raster as heights; options as `load_dem` takes them.
+    """Reads one band of a raster as heights; options as `load_dem` takes them.
 
     Raises InputError when rasterio is not installed, when the file cannot be read or refers to others, is a picture
     without its scales, is in degrees, feet or another system whose metre is none on the ground, or does not run east
@@ -85,7 +85,7 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
 
 @contextmanager
 def _gdal() -> Iterator[None]:
-    """GDAL as it is wanted here, and one line for whatever it cannot read."""
+    """Configures GDAL, and turns whatever it cannot read into one line."""
     try:
         import rasterio
     except ImportError:
@@ -118,7 +118,7 @@ def _use_own_database() -> None:
 
 
 def _opened(name: str, drivers: tuple[str, ...]) -> tuple[Any, bool]:
-    """The data set, and whether it says where it lies: where it does not, GDAL's numbers for that mean nothing."""
+    """Opens the data set, and tells whether it is georeferenced: if not, GDAL's numbers for its place mean nothing."""
     import rasterio
 
     with warnings.catch_warnings(record=True) as caught:
@@ -204,7 +204,7 @@ class _FromFile:
 
 
 def _read(file: Any, band: int, window: Any = None) -> np.ma.MaskedArray:
-    """The pixels of a band; those that are not known, or wholly transparent, are masked."""
+    """Reads the pixels of a band; those that are unknown or fully transparent are masked."""
     read = file.read(band, window=window, masked=True)
     for other in file.indexes:
         if other != band and _is_opacity(file, other):  # GDAL masks by it for whole numbers alone
@@ -221,7 +221,7 @@ def _in_metres(
 
 
 def _variable(path: Path, file: Any, name: int | str | None) -> tuple[Any, bool]:
-    """The variable of that name of a netCDF file that has several."""
+    """Finds the variable of that name in a netCDF file that has several."""
     found = {subdataset.rpartition(":")[2]: subdataset for subdataset in file.subdatasets}
     variable = str(name).partition(":")[0]
     require(variable in found, "--band", name, f"a variable of the file: {', '.join(found)}")
@@ -230,7 +230,7 @@ def _variable(path: Path, file: Any, name: int | str | None) -> tuple[Any, bool]
 
 
 def _band(file: Any, wanted: int | str | None) -> int:
-    """The number of the band, from 1, that holds the heights."""
+    """Returns the number, from 1, of the band that holds the heights."""
     if isinstance(wanted, str) and file.driver == "netCDF":
         wanted = int(wanted.partition(":")[2] or 0) if wanted.partition(":")[2].isdigit() else None
     names = [description or "" for description in file.descriptions]
@@ -262,7 +262,7 @@ def _is_opacity(file: Any, band: int) -> bool:
 
 
 def _is_grey(file: Any) -> bool:
-    """Whether a picture of colours, or one with an opacity, holds one grey that is no flat colour."""
+    """Tells whether a picture with colours or an opacity holds a single grey channel that is not one flat colour."""
     if set(file.dtypes) - {"uint8", "uint16"} or file.count > 4:
         return False
     colours = [band for band in file.indexes if not _is_opacity(file, band)]
@@ -306,7 +306,7 @@ def _require_no_degrees(file: Any) -> None:
 
 
 def _place(file: Any, placed: bool, cell_size: float | None) -> tuple[float, tuple[float, float], bool]:
-    """(cell size, x and y of the south-west value, whether the first row is the southernmost)."""
+    """Returns (cell size, x and y of the south-west value, whether the first row is the southernmost)."""
     transform = file.transform
     if not placed:
         if cell_size is None:

@@ -33,7 +33,7 @@ class SmallHoles:
                 self.count += int(np.count_nonzero(small[row]))
 
     def within(self, rows: slice, cols: slice) -> np.ndarray | None:
-        """Which cells of a part lie in small holes, [rows, cols] bool; None where none does."""
+        """Returns which cells of a part lie in small holes, [rows, cols] bool, or None where none does."""
         there = [row for row in range(rows.start, rows.stop) if row in self._packed] if self._packed else []
         if not there:
             return None
@@ -65,7 +65,7 @@ class _Holes:
                     yield rows, small
 
     def _deep(self) -> np.ndarray:
-        """Whether the hole to which each group of a part belongs reaches too far from known ground: [groups] bool."""
+        """Tells whether the hole that each group of a part belongs to reaches too far from known ground: [groups] bool."""
         from scipy import ndimage  # takes 0.3 s to import
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components
@@ -116,7 +116,7 @@ def _touching(south: np.ndarray, north: np.ndarray) -> np.ndarray:
 
 
 def interpolated(heights: np.ndarray, holes: np.ndarray) -> np.ndarray:
-    """Heights where each cell of a hole is the mean of its four neighbours: a plane stays one, no new extremes arise.
+    """Fills each cell of a hole with the mean of its four neighbours: a plane stays a plane, and no new extremes arise.
 
     What lies outside the part does not count. Cells beside a hole are known or of the same hole.
     """

@@ -37,7 +37,7 @@ class HeightSource(Protocol):
         """(rows, cols)."""
 
     def __getitem__(self, part: tuple[slice, slice]) -> np.ndarray:
-        """A part between whole, positive numbers, [rows, cols] float64."""
+        """Reads a part of the raster, [rows, cols] float64; the bounds of both slices are whole numbers from 0."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def marks_nothing(nodata: float | None, dtype: np.dtype) -> tuple[str, ...]:
 
 
 def is_real(dtype: np.dtype) -> bool:
-    """Whether numbers of that type can be heights."""
+    """Tells whether numbers of that type can be heights."""
     return dtype.kind in "iuf"
 
 
@@ -210,7 +210,7 @@ def require_fine(cell_size: float, allow_coarse: bool) -> None:
 
 
 def agreed_cell_size(of_file: float, given: float | None) -> float:
-    """The file's cell size; raises InputError for a bad one, or when the one given contradicts it."""
+    """Returns the file's cell size; raises InputError for a bad one, or when the given one contradicts it."""
     require_number("cell_size", of_file, 0, 1000, "metres, above 0 and at most 1000")
     if given is not None:
         require(abs(given - of_file) < 1e-4 * of_file, "cell_size", given, f"left out: the file says {of_file:g}")

@@ -25,7 +25,7 @@ class Surface:
     """
 
     def __init__(self, raster: Raster, spacing: float, offset: float, fill_holes: bool):
-        """offset: metres above which heights are counted."""
+        """Takes the metres above which heights are counted as `offset`."""
         self._raster, self._offset = raster, offset
         self._ratio = 1.0 if abs(spacing / raster.cell_size - 1) < 1e-6 else spacing / raster.cell_size
         rows, cols = (int((edge - 1) / self._ratio + 1e-6) + 1 for edge in raster.heights.shape)
@@ -61,7 +61,7 @@ class Surface:
         return self._tiles[i, j]
 
     def _made(self, rows: slice, cols: slice) -> np.ndarray:
-        """The nodes of a tile: [rows, cols] float32."""
+        """Makes the nodes of a tile: [rows, cols] float32."""
         around = int(REACH / self._raster.cell_size) + int(4 * _sigma(self._ratio)) + 2
         parts = []
         for nodes, edge in zip((rows, cols), self._raster.heights.shape, strict=True):
@@ -84,12 +84,12 @@ class Surface:
 
 
 def _sigma(ratio: float) -> float:
-    """Standard deviation, in cells, of the Gaussian by which a finer raster is smoothed before it is sampled."""
+    """Returns the standard deviation, in cells, of the Gaussian that smooths a finer raster before it is sampled."""
     return max(ratio - 1, 0) / 2
 
 
 def _sampled(heights: np.ndarray, at: list[np.ndarray], ratio: float) -> np.ndarray:
-    """Bilinear values at rows and columns of the heights; smoothed first where these are finer than the nodes.
+    """Samples heights bilinearly at rows and columns, and smooths them first where they are finer than the nodes.
 
     A node is unknown where a value that it is made from is.
     """

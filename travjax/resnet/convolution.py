@@ -14,7 +14,7 @@ from jax import lax
 
 
 def convolve(images: jax.Array, kernel: jax.Array, stride: int = 1, padding: int = 0) -> jax.Array:
-    """Cross-correlation without bias: [b, rows, cols, in] with [h, w, in, out] -> [b, rows, cols, out].
+    """Cross-correlates without bias: [b, rows, cols, in] with [h, w, in, out] -> [b, rows, cols, out].
 
     padding: rows and columns of zeros added on each side
     """
@@ -29,7 +29,7 @@ def convolve(images: jax.Array, kernel: jax.Array, stride: int = 1, padding: int
 
 
 def max_pool(images: jax.Array) -> jax.Array:
-    """Largest value of each 3 x 3 window, two pixels apart; the one pixel of padding never counts."""
+    """Takes the largest value of each 3 x 3 window, two pixels apart; the one pixel of padding never counts."""
     return _max_pool(images) if jax.default_backend() == "cpu" else _window_maxima(images)
 
 
@@ -55,13 +55,13 @@ def _correlate(images, kernel, stride: int, padding: int):
 
 
 def _flat(images):
-    """[pixels, channels], in memory: what comes before is not fused into what follows."""
+    """Reshapes to [pixels, channels] in memory, so that what comes before is not fused into what follows."""
     return lax.optimization_barrier(images.reshape(-1, images.shape[-1]))
 
 
 @jax.custom_vjp
 def _pointwise(images, kernel):
-    """A 1 x 1 convolution is one matrix product, and so are its gradients."""
+    """Computes a 1 x 1 convolution as one matrix product, and so its gradients."""
     return _pointwise_forward(images, kernel)[0]
 
 
@@ -83,7 +83,7 @@ _pointwise.defvjp(_pointwise_forward, _pointwise_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _same_resolution(images, kernel, padding: int):
-    """A convolution of stride 1: the gradient of its images is one as well, with the kernel turned round."""
+    """Computes a convolution of stride 1; the gradient of its images is one as well, with the kernel rotated."""
     return _correlate(images, kernel, 1, padding)
 
 
@@ -104,7 +104,7 @@ _same_resolution.defvjp(_same_resolution_forward, _same_resolution_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def _strided(images, kernel, stride: int, padding: int):
-    """Any other convolution; the gradient of its kernel is one matrix product over the patches under it."""
+    """Computes any other convolution; the gradient of its kernel is one matrix product over the patches under it."""
     return _correlate(images, kernel, stride, padding)
 
 
@@ -124,7 +124,7 @@ _strided.defvjp(_strided_forward, _strided_backward)
 
 
 def _window_places(images, result, window, stride: int, padding: int, fill):
-    """What lies under each place of a window, row by row: [b, rows, cols, channels] of `result` each."""
+    """Yields what lies under each place of a window, row by row: [b, rows, cols, channels] of `result` each."""
     edges = ((0, 0), (padding, padding), (padding, padding), (0, 0))
     padded = jnp.pad(images, edges, constant_values=fill)
     rows, cols = (stride * (count - 1) + 1 for count in result[1:3])
@@ -140,7 +140,7 @@ def _window_maxima(images):
 
 @jax.custom_vjp
 def _max_pool(images):
-    """The gradient goes to the first place of each window that holds the maximum."""
+    """Pools with a gradient that goes to the first place of each window that holds the maximum."""
     return _window_maxima(images)
 
 
@@ -154,7 +154,7 @@ def _max_pool_forward(images):
 
 
 def _max_pool_backward(saved, gradient):
-    """Each pixel gathers from the up to four windows that it lies in."""
+    """Gathers the gradient of each pixel from the up to four windows that it lies in."""
     place, (rows, cols) = saved
     row = jnp.arange(rows, dtype=jnp.int32)[:, None, None]
     col = jnp.arange(cols, dtype=jnp.int32)[:, None]
@@ -171,7 +171,7 @@ def _max_pool_backward(saved, gradient):
 
 
 def _spread(windows, below: int, right: int, rows: int, cols: int):
-    """The value of window ((row + below) // 2, (col + right) // 2) at each pixel."""
+    """Spreads the value of window ((row + below) // 2, (col + right) // 2) to each pixel."""
     padded = jnp.pad(windows, ((0, 0), (0, 1), (0, 1), (0, 0)))
     return padded.repeat(2, axis=1).repeat(2, axis=2)[:, below : below + rows, right : right + cols]
 
@@ -209,7 +209,7 @@ def _batch_norm_backward(epsilon: float, saved, gradients):
 
 
 def _total(pixels):
-    """Sum over the pixels [n, channels]; the operand is made first, since a fused sum runs on one core."""
+    """Sums over the pixels [n, channels]; the operand is made first, since a fused sum runs on one core."""
     return lax.optimization_barrier(pixels).sum(axis=0)
 
 

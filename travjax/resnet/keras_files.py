@@ -33,7 +33,7 @@ LARGEST_CHUNK = 1 << 26
 
 
 def open_keras(path: Path, held: ExitStack) -> WeightFile:
-    """A .keras file, open as long as `held` is."""
+    """Opens a .keras file for as long as `held` is open."""
     archive = held.enter_context(open_zip(path, ".keras"))
     parts = archive.namelist()
     if ARRAYS not in parts:
@@ -43,12 +43,12 @@ def open_keras(path: Path, held: ExitStack) -> WeightFile:
 
 
 def open_hdf5(path: Path, held: ExitStack) -> WeightFile:
-    """An .h5 file, open as long as `held` is."""
+    """Opens an .h5 file for as long as `held` is open."""
     return _opened(path, path.suffix.lower(), {}, held)
 
 
 def _opened(source: Path | io.BytesIO, kind: str, layer_names: dict[str, str], held: ExitStack) -> WeightFile:
-    """layer_names: of groups whose layer HDF5 does not name"""
+    """Opens an HDF5 file; layer_names: the layers of groups that HDF5 does not name"""
     try:
         import h5py
     except ImportError:
@@ -76,7 +76,7 @@ def _opened(source: Path | io.BytesIO, kind: str, layer_names: dict[str, str], h
 
 
 def _stored(item, name: str, kind: str) -> Stored:
-    """A data set, once it is known to lie in the file."""
+    """Returns a data set, once it is known to lie in the file."""
     with reading(kind):
         elsewhere = item.is_virtual or item.external is not None  # before its shape, for which HDF5 looks elsewhere
     if elsewhere:
@@ -98,7 +98,7 @@ def _stored(item, name: str, kind: str) -> Stored:
 
 
 def _name(place: list[str], layer: str | None) -> str:
-    """The layer is given by Keras 3, whose groups are only numbered: layers/batch_normalization_7/vars/0."""
+    """Names an array; `layer` comes from Keras 3, whose groups are only numbered: layers/batch_normalization_7/vars/0."""
     if layer is not None:
         order = NORM if len(place) > 2 and place[-3].startswith("batch_normalization") else ("kernel", "bias")
         return f"{layer}/{dict(zip('0123', order, strict=False)).get(place[-1], place[-1])}"
@@ -109,7 +109,7 @@ def _name(place: list[str], layer: str | None) -> str:
 
 
 def _layer_names(config: bytes) -> dict[str, str]:
-    """The layers' names by their groups, as Keras 3 numbers them; its first versions wrote no names beside arrays."""
+    """Returns the layers' names by group, as Keras 3 numbers them; its first versions wrote no names beside arrays."""
     with reading(".keras"):
         model = json.loads(config)
     names: dict[str, str] = {}
@@ -133,6 +133,6 @@ def _layer_names(config: bytes) -> dict[str, str]:
 
 
 def _snake_case(name: str) -> str:
-    """BatchNormalization -> batch_normalization, Conv2D -> conv2d."""
+    """Converts BatchNormalization to batch_normalization, Conv2D to conv2d."""
     name = re.sub("(.)([A-Z][a-z]+)", r"\1_\2", re.sub(r"\W+", "", name))
     return re.sub("([a-z])([A-Z])", r"\1_\2", name).lower()

@@ -39,12 +39,14 @@ class Naming:
     input: str = "torch"
 
     def stored(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        """The shape in the file of an array of canonical shape."""
+        """Returns the shape in the file of an array of canonical shape."""
         return (*shape[:-3:-1], *shape[:-2]) if self.by_output else shape
 
 
 def _position(layer: str) -> tuple[int, int, int]:
-    """Stage from 2, block from 0, and 0 for the projection or 1 to 3 along the block: "res3b_branch2c" is (3, 1, 3)."""
+    """Returns (stage from 2, block from 0, 0 for the projection or 1 to 3 along the block): "res3b_branch2c" is (3, 1,
+    3).
+    """
     stage, block, branch = re.fullmatch(r"res(\d)([a-z])_branch(1|2[abc])", layer).groups()  # type: ignore[union-attr]
     return int(stage), ord(block) - ord("a"), {"1": 0, "2a": 1, "2b": 2, "2c": 3}[branch]
 
@@ -61,7 +63,7 @@ def _torchvision_name(layer: str, array: str) -> str:
 
 
 def _hugging_face_name(layer: str, array: str) -> str:
-    """Of ResNetForImageClassification: modeling_resnet.py of huggingface/transformers."""
+    """Names an array as ResNetForImageClassification does (modeling_resnet.py of huggingface/transformers)."""
     if layer == "fc1000":
         return "classifier.1.weight" if array == "kernel" else "classifier.1.bias"
     place = "embedder.embedder"
@@ -72,7 +74,7 @@ def _hugging_face_name(layer: str, array: str) -> str:
 
 
 def _detectron_name(layer: str, array: str) -> str:
-    """Of the ResNet of facebookresearch/detectron2, whose classifier is called `linear`."""
+    """Names an array as the ResNet of facebookresearch/detectron2 does, whose classifier is called `linear`."""
     if layer == "fc1000":
         return "linear.weight" if array == "kernel" else "linear.bias"
     place = "stem.conv1"
@@ -98,7 +100,7 @@ def _caffe_name(layer: str, array: str) -> str:
 
 
 def _bare_hugging_face_name(layer: str, array: str) -> str:
-    """Of ResNetModel and ResNetBackbone."""
+    """Names an array as ResNetModel and ResNetBackbone do."""
     return _hugging_face_name(layer, array).removeprefix("resnet.")
 
 
@@ -132,14 +134,14 @@ class Recognised:
     left_out: list[str]
 
     def name(self, canonical: str) -> str:
-        """The name in the file."""
+        """Returns the name in the file."""
         return self.prefix + self.naming.name(*canonical.split("/"))
 
 
 def recognised(
     found: Mapping[str, Stored], namings: Sequence[Naming], shapes: dict[str, tuple[int, ...]], prefix: str | None
 ) -> Recognised:
-    """The naming and the prefix that most arrays follow.
+    """Returns the naming and the prefix that most arrays follow.
 
     shapes: of the network's arrays, with those of a top layer of CLASSES, by canonical name
     prefix: what the prefix is to begin with, where a file holds several networks
@@ -170,7 +172,7 @@ def recognised(
 
 
 def _prefixes(found: Mapping[str, Stored], first: str) -> list[str]:
-    """What stands before the first array's name, wherever it is found."""
+    """Returns what stands before the first array's name, wherever it is found."""
     starts = [name.removesuffix(first) for name in found if name.endswith(first)]
     return [start for start in starts if not start or start[-1] in "./"]
 
@@ -196,7 +198,7 @@ def _sorted_out(
 
 
 def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], naming: Naming, top: dict) -> bool:
-    """Whether the top layer is one of another number of classes, or without a bias for each of them."""
+    """Tells whether the top layer has another number of classes, or no bias for each of them."""
     kernel, bias = (found.get(in_file(name)) for name in top)
     if kernel is None or len(kernel.shape) != 2:
         return False
@@ -206,5 +208,5 @@ def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], n
 
 
 def _are_heads(shapes: list[tuple[int, ...]], features: int) -> bool:
-    """Whether arrays can be dense layers, with norms, on a network's features."""
+    """Tells whether arrays can be dense layers, with norms, on a network's features."""
     return all(len(shape) <= 2 for shape in shapes) and any(len(s) == 2 and features in s for s in shapes)

@@ -134,14 +134,14 @@ class ResNet(nnx.Module):
                 channels = EXPANSION * inner
 
     def _blocks(self) -> dict[int, list[str]]:
-        """Names of each stage's blocks."""
+        """Returns the names of each stage's blocks."""
         counts = enumerate(self.config.blocks, start=2)
         return {stage: [f"res{stage}{letter}" for letter in ascii_lowercase[:count]] for stage, count in counts}
 
     def __call__(
         self, images: Float[Array, "b rows cols 3"], *, train: bool = False
     ) -> tuple[Float[Array, "b features"], dict[str, Array]]:
-        """Features, float32, and the activations after the stem's pooling and after each stage, by name.
+        """Returns features, float32, and the activations after the stem's pooling and after each stage, by name.
 
         train: normalise by the batch's statistics and update the running ones
         """

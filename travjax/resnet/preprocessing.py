@@ -85,14 +85,16 @@ def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.
 
 
 def has_statistics(arrays: dict[str, np.ndarray]) -> bool:
-    """Whether any running mean is not 0 or any running variance not 1, or 1 less an epsilon, as Detectron2 has it."""
+    """Tells whether any running mean differs from 0 or any running variance from 1, or from 1 less an epsilon
+    (Detectron2).
+    """
     nearly = {"mean": (0, 0), "var": (1, 2e-5)}
     off = [np.abs(array - nearly[kind][0]).max() > nearly[kind][1] for kind, array in _of_kinds(arrays, *nearly)]
     return any(off)
 
 
 def is_untrained(arrays: dict[str, np.ndarray]) -> bool:
-    """Whether gamma is 1 or, at the end of a block, 0 throughout and nothing is added: a network before training."""
+    """Tells whether gamma is 1 or, at the end of a block, 0 throughout and beta is 0: a network before training."""
     allowed = {"gamma": (0, 1), "beta": (0,), "bias": (0,)}
     return all(np.isin(array, allowed[kind]).all() for kind, array in _of_kinds(arrays, *allowed))
 
@@ -150,7 +152,7 @@ def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, st
 
 
 def _meant(colours: np.ndarray, assumed: str) -> str | None:
-    """Which other input the mean of R, G and B tells, in units of (x / 255 - mean) / std as from `assumed`.
+    """Returns the other input that the mean of R, G and B points to, in units of (x / 255 - mean) / std of `assumed`.
 
     Images of a mean of their own are allowed: from "torch", only what is NEAR another input's mean is one; from "tf"
     and "unit", whatever is nearer to another's than to theirs.
@@ -168,7 +170,9 @@ def _meant(colours: np.ndarray, assumed: str) -> str | None:
 
 
 def _fitting(ratio: float, assumed: str) -> str:
-    """Under which inputs a first kernel of that ratio of variance to squares, canonical from `assumed`, would fit."""
+    """Returns the inputs for which the first kernel, canonical from `assumed`, has a plausible ratio of variance to
+    squares.
+    """
     scale = {name: float(np.mean(given.scale)) for name, given in INPUTS.items()}
     fitting = [name for name in INPUTS if LEAST <= ratio * (scale[assumed] / scale[name]) ** 2 <= MOST]
     if not fitting:
@@ -178,7 +182,7 @@ def _fitting(ratio: float, assumed: str) -> str:
 
 
 def _mean_of_colours(kernel: np.ndarray, mean: np.ndarray) -> np.ndarray | None:
-    """The mean of R, G and B [3] that explains the first running means; None where it does not, or where they are 0."""
+    """Fits the mean of R, G and B [3] that explains the first running means; None where none does, or where they are 0."""
     sums = kernel.sum(axis=(0, 1)).T
     if len(mean) < FEWEST or not mean.any():
         return None

@@ -76,23 +76,23 @@ def reading(kind: str) -> Iterator[None]:
 
 
 def shown(text: str) -> str:
-    """A text of a file, as one short line."""
+    """Shortens a text of a file to one line."""
     plain = text if text.isprintable() else ascii(text)[1:-1]
     return plain if len(plain) <= 200 else f"{plain[:200]} ..."
 
 
 def type_name(dtype: np.dtype) -> str:
-    """The name of a type; NumPy has none for bfloat16, whose arrays it writes as two bytes without a meaning."""
+    """Returns the name of a type; NumPy has none for bfloat16, whose arrays it writes as two bytes without a meaning."""
     return "bfloat16" if dtype.kind == "V" and dtype.itemsize == 2 and not dtype.names else dtype.name
 
 
 def as_named(array: np.ndarray) -> np.ndarray:
-    """The array as `type_name` calls it."""
+    """Views the array as the type that `type_name` names."""
     return array.view(jnp.bfloat16) if type_name(array.dtype) == "bfloat16" else array
 
 
 def open_zip(path: Path, kind: str) -> zipfile.ZipFile:
-    """A zip file, once its parts are known to be stored as NumPy, torch and Keras do it, and of different names."""
+    """Opens a zip file, once its parts are known to have different names and to be stored as NumPy, torch and Keras do."""
     with reading(kind):
         archive = zipfile.ZipFile(path)
     infos = archive.infolist()
@@ -105,7 +105,9 @@ def open_zip(path: Path, kind: str) -> zipfile.ZipFile:
 
 
 def unfolded(archive: zipfile.ZipFile, name: str, kind: str) -> bytes:
-    """A part of a zip file; raises InputError when it claims to be far longer than it is stored, or is longer."""
+    """Unpacks a part of a zip file; raises InputError when it claims far more than is stored, or is longer than it
+    claims.
+    """
     info = archive.getinfo(name)
     if info.file_size > min(LARGEST, EXPANSION * info.compress_size):
         raise InputError(
@@ -120,7 +122,7 @@ def unfolded(archive: zipfile.ZipFile, name: str, kind: str) -> bytes:
 
 
 def stored_npy(archive: zipfile.ZipFile, info: zipfile.ZipInfo, kind: str) -> Stored:
-    """An array of a zip file in NumPy's format."""
+    """Reads an array of a zip file in NumPy's format."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     with reading(kind), archive.open(info) as file:
         shape, _, dtype = readers[np.lib.format.read_magic(file)](file)

@@ -34,7 +34,7 @@ TYPES |= {"BF16": "bfloat16", "BOOL": "bool"}
 
 @contextmanager
 def open_arrays(path: Path) -> Iterator[WeightFile]:
-    """A file of weights, whose arrays can be read as long as it is open.
+    """Opens a file of weights, whose arrays can be read as long as it is open.
 
     Raises InputError, without the path, when the file is missing, of no known kind or damaged, needs code to be run,
     points to other files, or claims what its size does not bear out.
@@ -137,7 +137,7 @@ def _sum_of_notes(notes: dict) -> str:
 
 
 def _torch(path: Path, held: ExitStack) -> WeightFile:
-    """A saved state dict, or a checkpoint that holds one; only tensors and plain containers are unpickled."""
+    """Reads a saved state dict, or a checkpoint that holds one; only tensors and plain containers are unpickled."""
     try:
         import torch
     except ImportError:
@@ -160,7 +160,7 @@ def _torch(path: Path, held: ExitStack) -> WeightFile:
 
 
 def _check_torch_zip(path: Path) -> None:
-    """torch maps the file into memory without a look at its checksums."""
+    """Checks the checksums of a zip file of torch, which torch itself ignores."""
     with open_zip(path, ".pth") as archive:
         for info in archive.infolist():
             if info.compress_type or info.file_size != info.compress_size:
