@@ -126,7 +126,9 @@ def _require_heights_in_metres(keys: Keys, heights_scaled: bool) -> None:
 
 
 def _unit_metres(keys: Keys, key: int, size: int | None) -> float | None:
-    """Returns the metres of the unit that a key names, or None; a unit without a code has the length in the key `size`."""
+    """Returns the metres of the unit that a key names, or None; a unit without a code has the length in the key
+    `size`.
+    """
     code = int(keys.get(key, 0))
     if code == 0:
         return None

@@ -205,7 +205,9 @@ def _planes(nodes: np.ndarray) -> np.ndarray:
 
 
 def _spans(nodes: np.ndarray, shape: tuple[int, int]) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yields (triangle, row, first column, number of columns) of the nodes on triangles, about NODES_AT_ONCE at a time."""
+    """Yields (triangle, row, first column, number of columns) of the nodes on triangles, about NODES_AT_ONCE at a
+    time.
+    """
     first = np.maximum(np.ceil(nodes[:, 0, 1] - EDGE), 0).astype(np.int64)
     last = np.minimum(np.floor(nodes[:, 2, 1] + EDGE), shape[0] - 1).astype(np.int64)
     for some in _portions(np.maximum(last - first + 1, 0)):

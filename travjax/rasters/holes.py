@@ -65,7 +65,9 @@ class _Holes:
                     yield rows, small
 
     def _deep(self) -> np.ndarray:
-        """Tells whether the hole that each group of a part belongs to reaches too far from known ground: [groups] bool."""
+        """Tells whether the hole that each group of a part belongs to reaches too far from known ground: [groups]
+        bool.
+        """
         from scipy import ndimage  # takes 0.3 s to import
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import connected_components

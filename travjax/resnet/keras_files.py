@@ -98,7 +98,9 @@ def _stored(item, name: str, kind: str) -> Stored:
 
 
 def _name(place: list[str], layer: str | None) -> str:
-    """Names an array; `layer` comes from Keras 3, whose groups are only numbered: layers/batch_normalization_7/vars/0."""
+    """Names an array; `layer` comes from Keras 3, whose groups are only numbered:
+    layers/batch_normalization_7/vars/0.
+    """
     if layer is not None:
         order = NORM if len(place) > 2 and place[-3].startswith("batch_normalization") else ("kernel", "bias")
         return f"{layer}/{dict(zip('0123', order, strict=False)).get(place[-1], place[-1])}"

@@ -87,7 +87,7 @@ class ConvNorm(nnx.Module):
         self.stride, self.padding, self.config = stride, size // 2, config
 
     def __call__(self, images: Float[Array, "b rows cols in"], train: bool) -> Float[Array, "b _rows _cols out"]:
-        """With `train`, normalises by the batch's statistics and moves the running ones towards them."""
+        """Convolves and normalises; `train` uses the batch's statistics and moves the running ones towards them."""
         raw = convolve(images, self.kernel[...].astype(images.dtype), self.stride, self.padding)
         scale, bias, epsilon = self.scale[...], self.bias[...], self.config.epsilon
         if not train:

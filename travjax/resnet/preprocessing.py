@@ -74,7 +74,7 @@ FROM_CAFFE = "caffe --stride-in 1x1"
 
 
 def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.ndarray]:
-    """Canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std; equal but at the border, where the
+    """Returns canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std; equal but at the border, where the
     padding is of zeros whatever a zero stands for."""
     kernel = arrays["conv1/kernel"][:, :, ::-1] if given.reverse else arrays["conv1/kernel"]
     changed = {"conv1/kernel": kernel * given.scale[:, None]}
@@ -182,7 +182,9 @@ def _fitting(ratio: float, assumed: str) -> str:
 
 
 def _mean_of_colours(kernel: np.ndarray, mean: np.ndarray) -> np.ndarray | None:
-    """Fits the mean of R, G and B [3] that explains the first running means; None where none does, or where they are 0."""
+    """Fits the mean of R, G and B [3] that explains the first running means; None where none does, or where they are
+    0.
+    """
     sums = kernel.sum(axis=(0, 1)).T
     if len(mean) < FEWEST or not mean.any():
         return None

@@ -82,7 +82,9 @@ def shown(text: str) -> str:
 
 
 def type_name(dtype: np.dtype) -> str:
-    """Returns the name of a type; NumPy has none for bfloat16, whose arrays it writes as two bytes without a meaning."""
+    """Returns the name of a type; NumPy has none for bfloat16, whose arrays it writes as two bytes without a
+    meaning.
+    """
     return "bfloat16" if dtype.kind == "V" and dtype.itemsize == 2 and not dtype.names else dtype.name
 
 
@@ -92,7 +94,9 @@ def as_named(array: np.ndarray) -> np.ndarray:
 
 
 def open_zip(path: Path, kind: str) -> zipfile.ZipFile:
-    """Opens a zip file, once its parts are known to have different names and to be stored as NumPy, torch and Keras do."""
+    """Opens a zip file, once its parts are known to have different names and to be stored as NumPy, torch and Keras
+    do.
+    """
     with reading(kind):
         archive = zipfile.ZipFile(path)
     infos = archive.infolist()
