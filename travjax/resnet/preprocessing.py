@@ -74,8 +74,10 @@ FROM_CAFFE = "caffe --stride-in 1x1"
 
 
 def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.ndarray]:
-    """Returns canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std; equal but at the border, where the
-    padding is of zeros whatever a zero stands for."""
+    """Returns canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std.
+
+    The network is the same but at the border, where the padding is of zeros whatever a zero stands for.
+    """
     kernel = arrays["conv1/kernel"][:, :, ::-1] if given.reverse else arrays["conv1/kernel"]
     changed = {"conv1/kernel": kernel * given.scale[:, None]}
     if given.offset.any():
