@@ -21,7 +21,7 @@ LAYERS = {
     "runs": "checkpoint preset map_samples inference run_log run model_file predictor",
     "training": "trajectory_samples step trainer map_training evaluator network_benchmark",
     "commands": "options terrain label dataset weights train evaluate export predict bench",
-    "experiments": "launch transfer_runs robustness robustness_scores synthetic transfer timing comparison",
+    "experiments": "launch transfer_runs stand_ins robustness robustness_scores synthetic transfer timing comparison",
     "program": "cli",
 }
 """Packages from the bottom to the top, "" and "program" being travjax itself; in each, its modules likewise."""

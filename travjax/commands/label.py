@@ -20,7 +20,7 @@ from travjax.simulation import traverse
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.terrain.styles import STYLES
+from travjax.terrain.styles import are_rock_fields
 
 
 def add(commands: options.Commands) -> None:
@@ -49,7 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
     total, source, files = maps_of(arguments, grid)
     out = output_folder(arguments.out)
 
-    as_in_paper = not arguments.dem and traverse.as_in_paper(robot, actions)
+    noise = not arguments.dem and not are_rock_fields(arguments.style or (), arguments.world)
+    as_in_paper = noise and traverse.as_in_paper(robot, actions)
     config = options.configuration_json(robot, actions, grid, files=files, world=arguments.world)
     with NpzStream(out / "labels.npz", total, bytes_each(actions, grid), "labelled maps") as labels:
         for batch in options.progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling"):
@@ -76,9 +77,8 @@ def maps_of(arguments: argparse.Namespace, grid: Grid) -> tuple[int, Iterator[Ba
         require(given is None or given is False, f"--{name.replace('_', '-')}", given, allowed)
     if arguments.dem:
         return _dem_windows(arguments, grid)
-    styles, total, seed = arguments.style or list(STYLES), options.count(arguments), options.seed(arguments)
+    total, seed, styles = options.count(arguments), options.seed(arguments), options.styles(arguments, grid)
     names = [styles[number % len(styles)] for number in range(total)]
-    options.say_world(arguments.world, grid)
     return total, synthetic_batches(names, list(range(seed, seed + total)), grid, arguments.world), []
 
 

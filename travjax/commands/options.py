@@ -17,16 +17,21 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.terrain.styles import STYLES, require_world
+from travjax.terrain.rock_field import STYLE as ROCK_FIELD
+from travjax.terrain.styles import STYLES, are_rock_fields, require_world
 
 Commands = argparse._SubParsersAction
 """What `add(commands)` of a command adds its parser to."""
 
 
 def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> None:
-    """Styles, number and seed of synthetic maps; see `count` and `seed`."""
+    """Styles, number and seed of synthetic maps; see `styles`, `count` and `seed`."""
     parser.add_argument(
-        "--style", nargs="+", choices=STYLES, metavar="STYLE", help=f"styles: {', '.join(STYLES)} (all)"
+        "--style",
+        nargs="+",
+        choices=(*STYLES, ROCK_FIELD),
+        metavar="STYLE",
+        help=f"styles: {', '.join(STYLES)} (all); or {ROCK_FIELD}, other ground than the paper's",
     )
     parser.add_argument("--count", type=int, metavar="N", help=f"number of {each} ({count})")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the first map, counting on from there (0)")
@@ -123,6 +128,14 @@ def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
     parser.add_argument(
         "--out", type=user_path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})"
     )
+
+
+def styles(arguments: argparse.Namespace, grid: Grid) -> list[str]:
+    """The styles of synthetic maps; says what maps their features are those of, and refuses a bad world."""
+    styles = arguments.style or list(STYLES)
+    if not are_rock_fields(styles, arguments.world):
+        say_world(arguments.world, grid)
+    return styles
 
 
 def count(arguments: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from travjax.commands import options
 from travjax.data.map_batches import joined, synthetic_batches
 from travjax.files import output_folder, save_npz
 from travjax.simulation.grid import Grid
-from travjax.terrain.styles import STYLES
+from travjax.terrain.styles import are_rock_fields
 
 
 def add(commands: options.Commands) -> None:
@@ -26,16 +26,16 @@ def run(arguments: argparse.Namespace) -> None:
     from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
     grid = Grid(arguments.size, arguments.spacing)
-    styles = arguments.style or list(STYLES)
     count, seed = options.count(arguments), options.seed(arguments)
     out = output_folder(arguments.out)
+    styles = options.styles(arguments, grid)
     names = [style for style in styles for _ in range(count)]
     seeds = list(range(seed, seed + count)) * len(styles)
-    options.say_world(arguments.world, grid)
     batches = synthetic_batches(names, seeds, grid, arguments.world)
     maps = joined(list(options.progress(batches, len(names), "terrain")))
-    world = grid.size if arguments.world is None else arguments.world
-    progress.wrote(save_npz(out / "terrain.npz", cell_size=grid.spacing, world=world, **maps))
+    if not are_rock_fields(styles, arguments.world):
+        maps = {"world": np.asarray(grid.size if arguments.world is None else arguments.world), **maps}
+    progress.wrote(save_npz(out / "terrain.npz", cell_size=grid.spacing, **maps))
     for style in styles:
         chosen = np.flatnonzero(maps["group"] == style)[:24]
         titles = [f"seed {seed}" for seed in maps["seed"][chosen]]

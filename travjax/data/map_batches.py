@@ -10,29 +10,45 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from travjax.batching import BATCH
-from travjax.config import one_line, require
+from travjax.config import one_line, require, to_json
 from travjax.data.dem import Windows
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import failures, simulate
-from travjax.terrain.styles import FIELDS, elevation, sample_params
+from travjax.terrain.rock_field import rock_fields, sample_rock_field
+from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params
 
 Batch = dict[str, np.ndarray]
 
 
 def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: float | None = None) -> Iterator[Batch]:
-    """Maps of the styles and seeds [n] in a world, with the parameters and noise seeds that make them again."""
+    """Maps of the styles and seeds [n] in a world, with the parameters and noise seeds that make them again.
+
+    Raises InputError as `generate_terrain` does.
+    """
+    rocky = are_rock_fields(styles, world)
     for start in range(0, len(seeds), BATCH):
         names, numbers = styles[start : start + BATCH], seeds[start : start + BATCH]
-        params, noise_seeds = sample_params(names, numbers)
-        yield {
-            "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
-            "group": np.array(names),
-            "seed": np.array(numbers),
-            "noise_seed": np.asarray(noise_seeds),
-            **{field: np.asarray(getattr(params, field)) for field in FIELDS},
-        }
+        made = _rock_fields(numbers, grid) if rocky else _noise_maps(names, numbers, grid, world)
+        yield {"heights": made.pop("heights"), "group": np.array(names), "seed": np.array(numbers), **made}
+
+
+def _noise_maps(styles: list[str], seeds: list[int], grid: Grid, world: float | None) -> Batch:
+    """Heights, noise seeds and parameters of maps of the paper's styles."""
+    params, noise_seeds = sample_params(styles, seeds)
+    return {
+        "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
+        "noise_seed": np.asarray(noise_seeds),
+        **{field: np.asarray(getattr(params, field)) for field in FIELDS},
+    }
+
+
+def _rock_fields(seeds: list[int], grid: Grid) -> Batch:
+    """Heights and parameters of rock fields."""
+    params = [to_json(sample_rock_field(seed)) for seed in seeds]
+    fields = {field: np.array([one[field] for one in params]) for field in params[0]}
+    return {"heights": rock_fields(seeds, grid), **fields}
 
 
 def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:

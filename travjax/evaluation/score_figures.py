@@ -153,10 +153,11 @@ def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
 _PHASE = dict(xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8, color="0.4")
 
 
-def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
+def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
     """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
 
-    arms: their colours. Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
+    arms: their colours; maps: what they are trained on
+    Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
     """
     figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
     axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
@@ -170,7 +171,7 @@ def transfer_figure(results: Results, arms: Mapping[str, str]) -> Figure:
         always = results.always(site)
         ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
         ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
-        ax.set(xlabel="epoch on real maps", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
+        ax.set(xlabel=f"epoch on {maps}", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
         ax.grid(alpha=0.3)
     axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
     axes[0].legend(fontsize=9)

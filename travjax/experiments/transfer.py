@@ -47,6 +47,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--data", type=user_path, metavar="DIR", help="data set of real maps, instead of that of the sites"
     )
     parser.add_argument(
+        "--stand-ins",
+        action="store_true",
+        help="built-in sites instead of real maps; the default where no file of the sites is found",
+    )
+    parser.add_argument(
         "--out", type=user_path, metavar="DIR", help="folder to write to (runs/transfer/ and the preset's name)"
     )
     parser.add_argument(
@@ -73,18 +78,25 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     """The experiment of a preset in a folder that no other process uses."""
     from travjax.devices import Devices
     from travjax.evaluation.transfer_scores import Results
+    from travjax.experiments.stand_ins import chosen_stand_ins
     from travjax.experiments.transfer_runs import Transfer, TransferConfig, run_all
 
-    config, devices = load_toml(path, TransferConfig), Devices.all()
+    config = load_toml(path, TransferConfig)
+    sites = path.parent / user_path(config.sites)
+    stand_ins = chosen_stand_ins(sites, out, arguments.stand_ins, arguments.data)
+    if stand_ins:
+        print(stand_ins.sentence, flush=True)
+        config = stand_ins.in_place_of_real(config)
+    devices = Devices.all()
     _require_same(out, config)
     base = _base(path.parent / user_path(config.synthetic), arguments)
     synthetic = arguments.synthetic or out / "synthetic"
-    data = _data(path.parent / user_path(config.sites), arguments.data, base, out)
+    data = _data(sites, arguments.data, base, out, stand_ins)
     transfer = Transfer(config, base, synthetic, data, out, devices)  # refuses what does not fit before hours of work
     if not arguments.synthetic:
         _train_synthetic(base, synthetic, devices)
     say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
-    _write(transfer, Results.from_rows(run_all(transfer, say)), out)
+    _write(transfer, Results.from_rows(run_all(transfer, say)), out, stand_ins)
 
 
 def _require_same(out: Path, config) -> None:
@@ -122,7 +134,7 @@ TABLES = "evaluation/tables.txt"
 """Tables of `travjax evaluate` in the folder of a training run."""
 
 
-def _data(sites: Path, given: Path | None, base, out: Path):
+def _data(sites: Path, given: Path | None, base, out: Path, stand_ins):
     """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
     from travjax.data import dataset
     from travjax.runs.run import DATA
@@ -135,10 +147,13 @@ def _data(sites: Path, given: Path | None, base, out: Path):
     from travjax.commands.dataset import made_of_sites
     from travjax.data.provenance import SitesConfig
 
-    return made_of_sites(SitesConfig.load(sites), base.robot, base.actions, base.grid, out / DATA)
+    if stand_ins:
+        stand_ins.write()
+    config = stand_ins.sites if stand_ins else SitesConfig.load(sites)
+    return made_of_sites(config, base.robot, base.actions, base.grid, out / DATA)
 
 
-def _write(transfer, results, out: Path) -> None:
+def _write(transfer, results, out: Path, stand_ins) -> None:
     """Tables, figures, JSON and the report."""
     from travjax.evaluation import map_figures, score_figures
     from travjax.evaluation.dataset_tables import statistics_table
@@ -147,16 +162,17 @@ def _write(transfer, results, out: Path) -> None:
     from travjax.experiments.transfer_runs import IMAGENET
 
     config, base = transfer.config, transfer.base
+    kind = "stand-in" if stand_ins else "real"
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
     tables = {
         "First weights": arms_table(results),
         f"Events, {transfer.arms[-1]}": events_table(results, transfer.arms[-1]),
-        "Real maps": statistics_table(transfer.dataset, as_in_paper=False),
+        f"{kind.capitalize()} maps": statistics_table(transfer.dataset, as_in_paper=False),
     }
     for title, table in tables.items():
         print(f"\n{title}\n{table}")
     print()
-    figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS), out / "f1.png")]
+    figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
     if config.shown_maps:
         figures.append(map_figures.save(_maps_figure(transfer), out / "maps.png"))
     described: dict[str, Any] = {
@@ -169,7 +185,7 @@ def _write(transfer, results, out: Path) -> None:
     save_text(out / "results.json", json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
     intro = (
         f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_samples(transfer)} "
-        f"of real maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
+        f"of {kind} maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
     )
     if base.preset.weights == "none" and IMAGENET in transfer.arms:
         intro += f" Without ImageNet weights the arm {IMAGENET} begins with random ones as well."
@@ -177,11 +193,12 @@ def _write(transfer, results, out: Path) -> None:
     sections = {"Synthetic test maps": read_text(synthetic).strip()} if synthetic.exists() else {}
     sections |= tables
     pieces: list[launch.Piece] = [
+        *([f"**{stand_ins.sentence}**"] if stand_ins else []),
         intro,
         *(f"## {title}\n\n{launch.verbatim(table)}" for title, table in sections.items()),
         *figures,
     ]
-    report = launch.write_report(out, "Transfer to real maps", pieces)
+    report = launch.write_report(out, f"Transfer to {kind} maps", pieces)
     progress.wrote(report, out / "results.json", *figures)
 
 

@@ -6,13 +6,15 @@ one of them changes without the others. SITES are two sites of different charact
 """
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from travjax.config import require, require_length, require_number
 from travjax.simulation.arrays import integers
+from travjax.simulation.grid import Grid
 from travjax.terrain.landforms import Nodes, craters, draw_rocks, fractal_relief, lay_rocks, ledges, ruts
 
 STYLE = "rock_field"
@@ -79,8 +81,6 @@ class RockFieldParams:
             require_length(low, getattr(self, low), least, most)
             require_length(high, getattr(self, high), getattr(self, low), most)
 
-
-FIELDS = tuple(field.name for field in fields(RockFieldParams))
 
 RANGES: dict[str, tuple[float, float]] = {
     "hurst": (0.5, 0.8),
@@ -166,6 +166,12 @@ def rock_field(params: RockFieldParams, seed: int, shape: tuple[int, int], spaci
     free = [not driven[nodes.nearest(x, y)] for x, y in zip(rocks.x, rocks.y, strict=True)]
     ground = lay_rocks(ground, nodes, rocks.only(np.array(free, bool)))
     return ground - ground[nodes.rows // 2, nodes.cols // 2]
+
+
+def rock_fields(seeds: Sequence[int], grid: Grid) -> np.ndarray:
+    """Returns a rock field for each seed, with the parameters of it: [n, rows, cols] float32 metres."""
+    maps = [rock_field(sample_rock_field(seed), seed, grid.shape, grid.spacing) for seed in seeds]
+    return np.array(maps, np.float32)
 
 
 def site_heights(name: str, spacing: float = 0.0625) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2).
+"""Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2), and a door to rock_field.py beside them.
 
 A style and a seed give the parameters and the noise seed; these give the map. Plains and mountains are two noise
 fields, mixed by a third one: Z = plains * w + mountains * (1 - w). All three share one noise seed.
@@ -22,6 +22,8 @@ from travjax.jax_flags import key_of, usual_flags
 from travjax.simulation.arrays import integers, numbers
 from travjax.simulation.grid import Grid, require_grid
 from travjax.terrain.noise import SEEDS, noise_on_axes, permutation_table
+from travjax.terrain.rock_field import STYLE as ROCK_FIELD
+from travjax.terrain.rock_field import rock_fields
 
 
 @partial(
@@ -143,30 +145,53 @@ def generate_terrain(
 ) -> Float[Array, "n rows cols"]:
     """Maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
 
-    style: one of STYLES, or a sequence with one for each seed
+    style: one of STYLES, or a sequence with one for each seed; or rock_field.STYLE for all of them
     seeds: integers in [0, 2^32): a sequence, a range or one number
-    world: as `elevation` takes it
-    Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1.
+    world: as `elevation` takes it; none for rock fields
+    Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1, or those of landforms.py.
     Raises InputError for an unknown style, no or bad seeds, another number of styles than of seeds, or a bad world.
     """
+    if are_rock_fields([style] if isinstance(style, str) else list(style), world):
+        _, numbered = _styles_and_seeds(style, seeds, (ROCK_FIELD,))
+        require_grid(grid)
+        return jnp.asarray(rock_fields(numbered.tolist(), grid))
     return elevation(*sample_params(style, seeds), grid=grid, world=world)
 
 
 @usual_flags()
 def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, " n"]]:
     """The parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and errors."""
+    styles, numbered = _styles_and_seeds(style, seeds, STYLES)
+    index = np.array([STYLES.index(name) for name in styles], np.uint32)
+    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbered.astype(np.uint32)))
+    return TerrainParams(*values.T), noise_seeds
+
+
+def are_rock_fields(styles: Sequence[str], world: float | None) -> bool:
+    """Whether maps of these styles are rock fields.
+
+    Raises InputError when some are and others are not, and when a world is given for them.
+    """
+    if ROCK_FIELD not in styles:
+        return False
+    others = [style for style in dict.fromkeys(styles) if style != ROCK_FIELD]
+    require(not others, f"style beside {ROCK_FIELD}", others, "left out: its maps are made by parameters of their own")
+    require(world is None, "world", world, f"left out for {ROCK_FIELD}, whose features have sizes of their own")
+    return True
+
+
+def _styles_and_seeds(style: str | Sequence[str], seeds: Any, known: Sequence[str]) -> tuple[list[str], np.ndarray]:
+    """The style and the seed of each map, [n] each."""
     allowed = f"one or more integers from 0 to {2**32 - 1}"
     numbered = np.atleast_1d(integers("seeds", seeds, allowed, 0, 2**32 - 1))
     require(numbered.ndim == 1, "seeds", seeds, allowed)
     styles = [style] * len(numbered) if isinstance(style, str) else list(style)
     for name in set(styles):
-        require(name in STYLES, "style", name, f"one of {', '.join(STYLES)}")
+        require(name in known, "style", name, f"one of {', '.join(known)}")
     require(
         len(styles) == len(numbered), "style", f"{len(styles)} styles for {len(numbered)} seeds", "one, or one a seed"
     )
-    index = np.array([STYLES.index(name) for name in styles], np.uint32)
-    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbered.astype(np.uint32)))
-    return TerrainParams(*values.T), noise_seeds
+    return styles, numbered
 
 
 @jax.jit

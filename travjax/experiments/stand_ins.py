@@ -1,0 +1,97 @@
+"""Built-in sites that stand in for real maps where there are none: rock fields, split and read as real ones are."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from travjax.config import InputError, require
+from travjax.data.provenance import SitesConfig
+from travjax.experiments.transfer_runs import TransferConfig
+from travjax.files import find_data, output_folder, put_back, save_npz
+from travjax.runs.run import DATA
+from travjax.terrain.rock_field import SITES, site_heights
+
+DESCRIPTION = "stand_in_sites.toml"
+"""The stand-in sites and how they are split, beside the file of the real ones."""
+
+FOLDER = "stand_ins"
+"""Where an experiment keeps their rasters, in its own folder."""
+
+SPACING = 0.0625
+"""Metres between the nodes of the rasters."""
+
+
+@dataclass(frozen=True)
+class StandIns:
+    """The stand-in sites of an experiment.
+
+    sites:  what a data set is made from: stride, gap and so on of the real sites
+    folder: of the rasters
+    """
+
+    sites: SitesConfig
+    folder: Path
+
+    @staticmethod
+    def load(real: Path, out: Path) -> "StandIns":
+        """The sites that stand in for those of the file `real`, for an experiment in the folder `out`.
+
+        Raises InputError when that file or the one of the stand-ins beside it is missing or wrong.
+        """
+        config, path, folder = SitesConfig.load(real), real.parent / DESCRIPTION, out / FOLDER
+        sites = SitesConfig.load(path).site
+        for site in sites:
+            require(Path(site.file).stem in SITES, f"{path}: file", site.file, f"{', '.join(SITES)}, and .npz")
+        placed = tuple(replace(site, file=str(folder / site.file)) for site in sites)
+        return StandIns(replace(config, site=placed), folder)
+
+    def in_place_of_real(self, config: TransferConfig) -> TransferConfig:
+        """Returns an experiment on them; of maps it shows those of the last site."""
+        sites = Path(config.sites).with_name(DESCRIPTION)
+        return replace(config, sites=str(sites), shown=self.sites.site[-1].group)
+
+    @property
+    def sentence(self) -> str:
+        """What they are, for those who read results."""
+        names = " and ".join(Path(site.file).stem for site in self.sites.site)
+        return (
+            f"Built-in stand-in sites take the place of real maps: {names}, made by travjax (docs/stand-in-sites.md). "
+            "Scores on them are no evidence about real ground."
+        )
+
+    def write(self) -> None:
+        """Writes the rasters."""
+        output_folder(self.folder)
+        for site in self.sites.site:
+            path = Path(site.file)
+            save_npz(path, heights=site_heights(path.stem, SPACING), cell_size=SPACING)
+
+
+def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> StandIns | None:
+    """The stand-in sites where they are asked for, or where neither a data set nor any file of the real sites is there.
+
+    real: TOML file of the real sites; out: folder of the experiment; data: data set that is given
+    Raises InputError where a data set is given beside them, and where real maps would go on with what stand-ins began.
+    """
+    put_back(out / DATA)
+    begun = (out / FOLDER).exists()
+    if asked:
+        require(data is None, "--data", str(data), "left out where --stand-ins is given")
+    elif data is None and (begun or not (out / DATA / "dataset.json").exists()):
+        asked = _none_is_there(real)
+    if begun and not asked:
+        allowed = "another folder, or --stand-ins to go on with it"
+        raise InputError(f"--out {out}: holds an experiment on stand-in sites; allowed: {allowed}")
+    return StandIns.load(real, out) if asked else None
+
+
+def _none_is_there(real: Path) -> bool:
+    """Whether no file of the real sites is there, and stand-ins are described beside them."""
+    described = (real.parent / DESCRIPTION).is_file()
+    return described and not any(_is_there(site.file) for site in SitesConfig.load(real).site)
+
+
+def _is_there(file: str) -> bool:
+    try:
+        return bool(find_data(file, "site"))
+    except InputError:
+        return False
