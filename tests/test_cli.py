@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,7 @@ from travjax.evaluation.tables import shares_table
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.terrain.rock_field import RockFieldParams, rock_field
 from travjax.terrain.styles import FIELDS
 
 CELL = 0.0625
@@ -254,6 +255,25 @@ def test_maps_of_the_terrain_command_can_be_labelled_from_their_file(terrain, tm
     margins = travjax.simulate(made["heights"])
     np.testing.assert_allclose(arrays["step"], margins.step, rtol=0, atol=2e-6)
     np.testing.assert_array_equal(arrays["failed"], travjax.label(arrays["heights"]))
+
+
+def test_rock_fields_are_written_with_all_that_makes_them(tmp_path):
+    done = succeeds(tmp_path, "terrain", "--style", "rock_field", "--count", 2, "--seed", 3, "--size", 4)
+    assert printed_files(done) == {tmp_path / "terrain.npz", tmp_path / "terrain_rock_field.png"}
+    arrays = done.arrays("terrain.npz")
+    assert arrays["heights"].shape == (2, 65, 65) and arrays["seed"].tolist() == [3, 4] and "world" not in arrays
+    names = [field.name for field in fields(RockFieldParams)]
+    params = RockFieldParams(**{name: float(arrays[name][1]) for name in names})
+    np.testing.assert_array_equal(arrays["heights"][1], rock_field(params, 4, (65, 65), CELL).astype(np.float32))
+
+
+def test_rock_fields_are_labelled_and_not_compared_with_the_paper(tmp_path):
+    done = succeeds(tmp_path, "label", "--style", "rock_field", "--count", 2, "--no-figures")
+    arrays = done.arrays()
+    assert arrays["group"].tolist() == ["rock_field"] * 2 and "rock_abundance" in arrays
+    np.testing.assert_array_equal(arrays["heights"], travjax.generate_terrain("rock_field", range(2)))
+    np.testing.assert_array_equal(arrays["failed"], travjax.label(arrays["heights"]))
+    assert "paper" not in done.out
 
 
 # ---- Elevation maps
@@ -490,6 +510,11 @@ BAD_WORDS = {
     "large seed": (["label", "--seed", str(2**31)], "--seed = 2147483648: must be from 0 to 2147483647"),
     "unknown style": (["label", "--style", "bumpy"], "--style.*'bumpy'.*mountain_crater.*scattered_sharp"),
     "unknown style of terrain": (["terrain", "--style", "smooth", "bumpy"], "--style.*'bumpy'"),
+    "rock fields beside other styles": (
+        ["label", "--style", "rock_field", "rough"],
+        r"style beside rock_field = \['rough'\]: must be left out",
+    ),
+    "world of rock fields": (["terrain", "--style", "rock_field", "--world", "8"], "world = 8.0: must be left out for"),
     "unknown option": (["label", "--fast"], "--fast"),
     "unknown command": (["guess"], "'guess'.*terrain.*label.*bench"),
     "no command": ([], "COMMAND|command"),

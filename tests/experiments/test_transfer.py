@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from travjax.data.dataset import save
 from travjax.data.provenance import SitesConfig
 from travjax.experiments import transfer
 from travjax.experiments.transfer_runs import ARMS
+from travjax.files import find_preset
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
 
@@ -131,6 +133,34 @@ def test_a_model_and_a_data_set_may_be_given(whole, preset, trained, tmp_path):
     # `trained` is the run that the whole experiment makes for itself
     made, again = (loads((out / "results.json").read_text()) for out in (whole[1], tmp_path / "out"))
     assert made["arms"] == again["arms"]
+
+
+def test_without_real_maps_it_runs_on_stand_ins_and_says_so_everywhere(trained, tmp_path, monkeypatch):
+    monkeypatch.delenv("TRAVJAX_DATA", raising=False)
+    shutil.copy(find_preset("stand_in_sites", "transfer"), tmp_path)
+    (tmp_path / "sites.toml").write_text('stride = 8.0\n[[site]]\nfile = "quarry.npz"\n')
+    (tmp_path / "tiny.toml").write_text(TOML)
+    (tmp_path / "small.toml").write_text(PRESET.replace("[0, 1]", "[0]"))
+    out = tmp_path / "out"
+    words = (tmp_path / "small.toml", "--synthetic", trained, "--out", out)
+    code, printed, err = run(*words)
+    assert code == 0, err
+    first = printed.splitlines()[0]
+    assert first.startswith("Built-in stand-in sites take the place of real maps: bedrock_flats and crater_plain")
+    report = (out / "report.md").read_text()
+    assert report.startswith(f"# Transfer to stand-in maps\n\n**{first}**\n\n")
+    for part in ("samples of stand-in maps", "## Stand-in maps", "crater_plain (stand-in)", "(stand_in_sites.png)"):
+        assert part in report
+    assert "real maps for" not in report and "## Real maps" not in report
+    results = loads((out / "results.json").read_text())
+    assert results["config"]["shown"] == "crater_plain (stand-in)"
+    assert [site["name"] for site in results["real"]["sites"]] == [
+        "bedrock_flats (stand-in)",
+        "crater_plain (stand-in)",
+    ]
+    np.savez(tmp_path / "quarry.npz", heights=np.zeros((97, 97)), cell_size=GRID.spacing)
+    monkeypatch.chdir(tmp_path)
+    assert "holds an experiment on stand-in sites" in refused(*words)
 
 
 # ---- Bad input

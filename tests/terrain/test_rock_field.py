@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from travjax.config import InputError
+from travjax.simulation.grid import Grid
 from travjax.simulation.traverse import EVENTS, failures, simulate
 from travjax.terrain.rock_field import (
     RANGES,
@@ -15,6 +16,7 @@ from travjax.terrain.rock_field import (
     sample_rock_field,
     site_heights,
 )
+from travjax.terrain.styles import STYLES, generate_terrain
 
 PLAIN = RockFieldParams(rock_abundance=0.0)
 
@@ -125,6 +127,33 @@ def test_bad_parameters_are_named(field, value, allowed):
 def test_bad_arguments_are_named(changed, said):
     with pytest.raises(InputError) as error:
         rock_field(**({"params": PLAIN, "seed": 0, "shape": (9, 9), "spacing": 0.1} | changed))
+    assert str(error.value).startswith(said)
+
+
+def test_it_is_a_style_that_needs_no_parameters():
+    grid = Grid(4, 0.125)
+    maps = generate_terrain("rock_field", [3, 9], grid=grid)
+    assert maps.shape == (2, 33, 33) and maps.dtype == np.float32
+    np.testing.assert_array_equal(generate_terrain(["rock_field"] * 2, [9, 3], grid=grid)[::-1], maps)
+    alone = rock_field(sample_rock_field(9), 9, grid.shape, grid.spacing)
+    np.testing.assert_array_equal(maps[1], alone.astype(np.float32))
+    assert "rock_field" not in STYLES
+
+
+@pytest.mark.parametrize(
+    ("style", "seeds", "others", "said"),
+    [
+        (["rock_field", "wavy"], [1, 2], {}, "style beside rock_field = ['wavy']: must be left out"),
+        ("rock_field", [1], {"world": 8}, "world = 8: must be left out for rock_field"),
+        ("rock_field", [-1], {}, "seeds = [-1]: must be one or more integers from 0"),
+        (["rock_field"] * 2, [1], {}, "style = '2 styles for 1 seeds'"),
+        ("rock_field", [1], {"grid": Grid(8, 0.02)}, "spacing = 0.02: must be metres, from 0.03 to 1"),
+        ("rock_field", [1], {"grid": 8}, "grid = 8: must be a travjax.Grid"),
+    ],
+)
+def test_bad_arguments_of_the_style_are_named(style, seeds, others, said):
+    with pytest.raises(InputError) as error:
+        generate_terrain(style, seeds, **others)
     assert str(error.value).startswith(said)
 
 

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from travjax.config import InputError, require
 from travjax.data.provenance import SitesConfig
@@ -9,6 +12,10 @@ from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_data, output_folder, put_back, save_npz
 from travjax.runs.run import DATA
 from travjax.terrain.rock_field import SITES, site_heights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 DESCRIPTION = "stand_in_sites.toml"
 """The stand-in sites and how they are split, beside the file of the real ones."""
@@ -62,8 +69,43 @@ class StandIns:
         """Writes the rasters."""
         output_folder(self.folder)
         for site in self.sites.site:
-            path = Path(site.file)
-            save_npz(path, heights=site_heights(path.stem, SPACING), cell_size=SPACING)
+            save_npz(Path(site.file), heights=site_heights(Path(site.file).stem, SPACING), cell_size=SPACING)
+
+    def figure(self) -> "Figure":
+        """The sites in one colour scale, shaded from the north-west, with the strips of their splits."""
+        from matplotlib.colors import LightSource  # matplotlib takes 0.3 s to import
+        from matplotlib.figure import Figure
+
+        maps = [site_heights(Path(site.file).stem, SPACING) for site in self.sites.site]
+        widths, tall = [one.shape[1] for one in maps], max(one.shape[0] for one in maps)
+        figure = Figure(figsize=(11, 11 * 0.9 * tall / sum(widths) + 0.9), layout="constrained")
+        axes = figure.subplots(1, len(maps), squeeze=False, sharey=True, width_ratios=widths)[0]
+        low, high = np.percentile(np.concatenate([one.ravel() for one in maps]), [0.5, 99.5])
+        for ax, site, heights in zip(axes, self.sites.site, maps, strict=True):
+            north, east = ((edge - 1) * SPACING for edge in heights.shape)
+            extent = (0.0, east, 0.0, north)
+            image = ax.imshow(heights, origin="lower", extent=extent, cmap="cividis", vmin=low, vmax=high)
+            shade = LightSource(315, 35).hillshade(heights[::-1], dx=SPACING, dy=SPACING)[::-1]
+            ax.imshow(shade, origin="lower", extent=extent, cmap="gray", vmin=0, vmax=1, alpha=0.6)
+            for split, strip in site.strips.items():
+                if strip:
+                    _draw_strip(ax, split, *strip, east, north)
+            ax.set(title=f"{site.group}: {site.split}", xlabel="x, east [m]")
+        axes[0].set_ylabel("y, north [m]")
+        figure.colorbar(image, ax=axes.tolist(), label="elevation [m]", shrink=0.8)
+        return figure
+
+
+def _draw_strip(ax: "Axes", split: str, side: str, metres: float, east: float, north: float) -> None:
+    """Marks a strip of a site of so many metres to the east and to the north, and says what it is for."""
+    along_x, first = side in ("east", "west"), side in ("south", "west")
+    length, across = (east, north) if along_x else (north, east)
+    middle, inner = (metres / 2, metres) if first else (length - metres / 2, length - metres)
+    draw = ax.axvline if along_x else ax.axhline
+    draw(inner, color="white", linewidth=2.5)
+    draw(inner, color="black", linewidth=1.2, linestyle="--")
+    place = (middle, across * 0.97) if along_x else (across / 2, middle)
+    ax.text(*place, split, ha="center", va="top", fontsize=9, bbox=dict(facecolor="white", edgecolor="none", pad=2))
 
 
 def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> StandIns | None:

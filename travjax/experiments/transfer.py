@@ -173,6 +173,8 @@ def _write(transfer, results, out: Path, stand_ins) -> None:
         print(f"\n{title}\n{table}")
     print()
     figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
+    if stand_ins:
+        figures.append(map_figures.save(stand_ins.figure(), out / "stand_in_sites.png"))
     if config.shown_maps:
         figures.append(map_figures.save(_maps_figure(transfer), out / "maps.png"))
     described: dict[str, Any] = {
