@@ -131,7 +131,7 @@ def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
 
 
 def styles(arguments: argparse.Namespace, grid: Grid) -> list[str]:
-    """The styles of synthetic maps; says what maps their features are those of, and refuses a bad world."""
+    """Returns the styles of synthetic maps; says what maps their features are those of, and refuses a bad world."""
     styles = arguments.style or list(STYLES)
     if not are_rock_fields(styles, arguments.world):
         say_world(arguments.world, grid)

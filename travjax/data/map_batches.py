@@ -35,7 +35,7 @@ def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: fl
 
 
 def _noise_maps(styles: list[str], seeds: list[int], grid: Grid, world: float | None) -> Batch:
-    """Heights, noise seeds and parameters of maps of the paper's styles."""
+    """Makes maps of the paper's styles: their heights, noise seeds and parameters."""
     params, noise_seeds = sample_params(styles, seeds)
     return {
         "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
@@ -45,7 +45,7 @@ def _noise_maps(styles: list[str], seeds: list[int], grid: Grid, world: float | 
 
 
 def _rock_fields(seeds: list[int], grid: Grid) -> Batch:
-    """Heights and parameters of rock fields."""
+    """Makes rock fields: their heights and parameters."""
     params = [to_json(sample_rock_field(seed)) for seed in seeds]
     fields = {field: np.array([one[field] for one in params]) for field in params[0]}
     return {"heights": rock_fields(seeds, grid), **fields}

@@ -40,7 +40,7 @@ class StandIns:
 
     @staticmethod
     def load(real: Path, out: Path) -> "StandIns":
-        """The sites that stand in for those of the file `real`, for an experiment in the folder `out`.
+        """Returns the sites that stand in for those of the file `real`, for an experiment in the folder `out`.
 
         Raises InputError when that file or the one of the stand-ins beside it is missing or wrong.
         """
@@ -58,7 +58,7 @@ class StandIns:
 
     @property
     def sentence(self) -> str:
-        """What they are, for those who read results."""
+        """Says what they are, for those who read results."""
         names = " and ".join(Path(site.file).stem for site in self.sites.site)
         return (
             f"Built-in stand-in sites take the place of real maps: {names}, made by travjax (docs/stand-in-sites.md). "
@@ -72,7 +72,7 @@ class StandIns:
             save_npz(Path(site.file), heights=site_heights(Path(site.file).stem, SPACING), cell_size=SPACING)
 
     def figure(self) -> "Figure":
-        """The sites in one colour scale, shaded from the north-west, with the strips of their splits."""
+        """Draws the sites in one colour scale, shaded from the north-west, with the strips of their splits."""
         from matplotlib.colors import LightSource  # matplotlib takes 0.3 s to import
         from matplotlib.figure import Figure
 
@@ -109,7 +109,7 @@ def _draw_strip(ax: "Axes", split: str, side: str, metres: float, east: float, n
 
 
 def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> StandIns | None:
-    """The stand-in sites where they are asked for, or where neither a data set nor any file of the real sites is there.
+    """Returns the stand-in sites if asked for, or if neither a data set nor any file of the real sites is there.
 
     real: TOML file of the real sites; out: folder of the experiment; data: data set that is given
     Raises InputError where a data set is given beside them, and where real maps would go on with what stand-ins began.
@@ -127,7 +127,7 @@ def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> S
 
 
 def _none_is_there(real: Path) -> bool:
-    """Whether no file of the real sites is there, and stand-ins are described beside them."""
+    """Tells whether no file of the real sites is there, and stand-ins are described beside them."""
     described = (real.parent / DESCRIPTION).is_file()
     return described and not any(_is_there(site.file) for site in SitesConfig.load(real).site)
 

@@ -217,7 +217,7 @@ def lay_rocks(ground: np.ndarray, nodes: Nodes, rocks: Rocks) -> np.ndarray:
 
 
 def _half_axes(rocks: Rocks) -> tuple[np.ndarray, np.ndarray]:
-    """Half the length and half the width of outlines that have the area of their diameter."""
+    """Returns half the length and half the width of outlines that have the area of their diameter."""
     power = 1 / rocks.exponent
     gamma = np.array([math.gamma(1 + one) ** 2 / math.gamma(1 + 2 * one) for one in power])
     length = rocks.diameter / 4 * np.sqrt(np.pi / (gamma * rocks.sides))
@@ -316,14 +316,14 @@ def ruts(
 
 
 def _directions(rng: np.random.Generator, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
-    """Metres across and along lines of a random direction: two [rows, cols]."""
+    """Returns metres across and along lines of a random direction: two [rows, cols]."""
     angle = rng.uniform(0, np.pi)
     x, y = nodes.x[None, :], nodes.y[:, None]
     return x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
 
 
 def _crossings(rng: np.random.Generator, nodes: Nodes, density: float) -> np.ndarray:
-    """Places of lines across the raster, in metres from its middle: their number is a Poisson one."""
+    """Draws where lines cross the raster, in metres from its middle; their number has a Poisson distribution."""
     half = math.hypot(np.ptp(nodes.x), np.ptp(nodes.y)) / 2
     return rng.uniform(-half, half, rng.poisson(density * 2 * half))
 

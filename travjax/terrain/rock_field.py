@@ -192,7 +192,7 @@ def _nodes(shape: Any, spacing: Any) -> Nodes:
 
 
 def _generators(seed: int) -> list[np.random.Generator]:
-    """Random numbers for the parameters and for each landform, none of which depends on how the others are used."""
+    """Returns generators for the parameters and for each landform; none depends on how the others are used."""
     number = integers("seed", seed, _SEED, 0, 2**32 - 1)
     require(number.ndim == 0, "seed", seed, _SEED)
     return [np.random.Generator(np.random.PCG64(one)) for one in np.random.SeedSequence(int(number)).spawn(6)]

@@ -1,4 +1,4 @@
-"""Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2), and a door to rock_field.py beside them.
+"""Synthetic terrain: five styles of the paper's Algorithm 1 (SPEC section 2), and rock fields beside them.
 
 A style and a seed give the parameters and the noise seed; these give the map. Plains and mountains are two noise
 fields, mixed by a third one: Z = plains * w + mountains * (1 - w). All three share one noise seed.
@@ -168,7 +168,7 @@ def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int
 
 
 def are_rock_fields(styles: Sequence[str], world: float | None) -> bool:
-    """Whether maps of these styles are rock fields.
+    """Tells whether maps of these styles are rock fields.
 
     Raises InputError when some are and others are not, and when a world is given for them.
     """
@@ -181,7 +181,7 @@ def are_rock_fields(styles: Sequence[str], world: float | None) -> bool:
 
 
 def _styles_and_seeds(style: str | Sequence[str], seeds: Any, known: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """The style and the seed of each map, [n] each."""
+    """Returns the style and the seed of each map, [n] each; raises InputError for bad ones."""
     allowed = f"one or more integers from 0 to {2**32 - 1}"
     numbered = np.atleast_1d(integers("seeds", seeds, allowed, 0, 2**32 - 1))
     require(numbered.ndim == 1, "seeds", seeds, allowed)
