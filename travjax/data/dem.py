@@ -63,7 +63,7 @@ class Windows:
     _corners: np.ndarray  # [n, 3] surface, row, col
 
     def __len__(self) -> int:
-        """The number of windows."""
+        """Returns the number of windows."""
         return len(self._corners)
 
     @cached_property
@@ -191,7 +191,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """The rasters of a file, by what it holds."""
+    """Reads the rasters of a file, by what it holds."""
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
@@ -217,7 +217,7 @@ def _all(raster: Raster) -> np.ndarray:
 
 
 def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """The maps of an .npz, or its points."""
+    """Reads the maps of an .npz, or its points."""
     entries, names = read_npz(path)
     if "heights" in entries:
         return rasters_of(entries, options, names)
@@ -227,7 +227,9 @@ def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
 
 
 def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarray, float]:
-    """Of each window the raster, and row and column of its south-west node: [n, 3]; and the share that they cover."""
+    """Returns the raster of each window with row and column of its south-west node, [n, 3], and the share they
+    cover.
+    """
     step, found, covered = round(stride / grid.spacing), [], []
     for index, raster in enumerate(rasters):
         nodes = [int((edge - 1) * raster.cell_size / grid.spacing + 1e-6) + 1 for edge in raster.heights.shape]
@@ -242,7 +244,9 @@ def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarr
 
 
 def _offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
-    """Whole metres above which the heights of each raster are counted: the same unless they lie FAR_APART."""
+    """Returns the whole metres above which the heights of each raster are counted: the same unless they lie
+    FAR_APART.
+    """
     if rasters[0].height_offset is not None:
         return [raster.height_offset or 0.0 for raster in rasters]
     medians = np.array([found.median for found in surveys])

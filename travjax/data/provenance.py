@@ -192,12 +192,12 @@ class Provenance:
         return {name: getattr(self, name) for name in PROVENANCE_ARRAYS}
 
     def to_json(self) -> dict[str, Any]:
-        """All but the arrays as JSON can hold it."""
+        """Converts all but the arrays to what JSON can hold."""
         return {"config": to_json(self.config), "sites": [to_json(site) for site in self.sites]}
 
     @staticmethod
     def from_json(table: Any, origin: np.ndarray, quarter_turns: np.ndarray) -> "Provenance":
-        """From what `to_json` gave, and the arrays; raises InputError over anything else."""
+        """Restores it from what `to_json` gave and the arrays; raises InputError over anything else."""
         config = parts_from_json(table, {"config": SitesConfig})["config"]
         sites = table.get("sites")
         require(isinstance(sites, list), "sites", sites, "a list of tables")

@@ -38,7 +38,7 @@ class CorruptionConfig:
 
 
 def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) -> Maps:
-    """Maps as sensors may see them, filled where nodes are missing; float32."""
+    """Returns maps as sensors may see them, filled where nodes are missing; float32."""
     result = np.array(maps, np.float32)
     for index in np.flatnonzero(rng.random(len(maps)) < config.share):
         one = result[index : index + 1]
@@ -52,17 +52,17 @@ def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) ->
 
 
 def noisy(maps: Maps, deviation: float, rng: np.random.Generator) -> Maps:
-    """With independent Gaussian noise at each node; deviation: metres."""
+    """Adds independent Gaussian noise at each node; deviation: metres."""
     return maps + np.float32(deviation) * rng.standard_normal(maps.shape, dtype=np.float32)
 
 
 def thinned(maps: Maps, share: float, rng: np.random.Generator) -> Maps:
-    """With NaN for a share of the nodes, each independently."""
+    """Sets a share of the nodes, each independently, to NaN."""
     return np.where(rng.random(maps.shape) < share, np.float32(np.nan), maps)
 
 
 def upsampled(maps: Maps) -> Maps:
-    """From every second node, the others by bilinear interpolation.
+    """Keeps every second node and interpolates the others bilinearly.
 
     maps: with an even number of cells along each edge
     """
@@ -73,7 +73,7 @@ def upsampled(maps: Maps) -> Maps:
 
 
 def filled(maps: Maps) -> Maps:
-    """With the height of the nearest known node where NaN; a map without any known node is flat."""
+    """Gives each NaN the height of the nearest known node; a map without any known node becomes flat."""
     holes = np.isnan(maps)
     if not holes.any():
         return maps
@@ -88,10 +88,10 @@ def filled(maps: Maps) -> Maps:
 
 
 def smoothed(maps: Maps, deviation: float) -> Maps:
-    """By a Gaussian; deviation: nodes."""
+    """Smooths by a Gaussian; deviation: nodes."""
     return ndimage.gaussian_filter(maps, (0, deviation, deviation), mode="nearest")
 
 
 def median(maps: Maps) -> Maps:
-    """Of each 3 x 3 nodes."""
+    """Returns the median of each 3 x 3 nodes."""
     return ndimage.median_filter(maps, (1, 3, 3), mode="nearest")

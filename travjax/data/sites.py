@@ -14,6 +14,7 @@ two, with some metres of doubt. Local systems, and none, say nothing about that:
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
@@ -32,11 +33,17 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import failures, packed, simulate
 
-TRAIN, VALIDATION, TEST, TOO_UNKNOWN, NEAR_TEST, SHARED = ASSIGNMENTS = range(6)
-"""What becomes of a window: the first three are the index into SPLITS."""
 
-LEFT_OUT = {TOO_UNKNOWN: "too_unknown", NEAR_TEST: "near_test", SHARED: "shared"}
-"""Why a window is left out, as SiteRecord names it."""
+class Assignment(IntEnum):
+    """What a window is used for, numbered as in SPLITS, or why it is left out; named as in SiteRecord."""
+
+    TRAIN = 0
+    VALIDATION = 1
+    TEST = 2
+    TOO_UNKNOWN = 3
+    NEAR_TEST = 4
+    SHARED = 5
+
 
 TOLERANCE = 1e-6
 """Metres by which places of windows may be off."""
@@ -67,8 +74,8 @@ def read(
     records = _records(config, found, windows.site, assignment)
     _require_all(config, records, found, grid.size)
 
-    kept = np.flatnonzero(assignment <= TEST)
-    copied = np.flatnonzero(assignment == TRAIN) if config.rotations else kept[:0]
+    kept = np.flatnonzero(assignment <= Assignment.TEST)
+    copied = np.flatnonzero(assignment == Assignment.TRAIN) if config.rotations else kept[:0]
     source = np.concatenate([kept, *[copied] * 3])
     turns = np.repeat(np.arange(4, dtype=np.uint8), [len(kept), *[len(copied)] * 3])
     heights = np.empty((len(source), *grid.shape), np.float32)
@@ -90,7 +97,7 @@ def read(
 
 
 def turned(heights: np.ndarray, quarter_turns: int) -> np.ndarray:
-    """Maps [..., rows, cols] turned anticlockwise about their centre, x to the east and y to the north."""
+    """Turns maps [..., rows, cols] anticlockwise about their centre, x to the east and y to the north."""
     return np.rot90(heights, -quarter_turns, axes=(-2, -1))  # rows go north, so the other way round than printed
 
 
@@ -178,7 +185,7 @@ def _require_different(found: list[Windows]) -> None:
 def _labels(
     heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None
 ) -> np.ndarray:
-    """The labels of maps: [n, t] uint8."""
+    """Labels maps: [n, t] uint8."""
     labels = np.empty((len(heights), len(actions)), np.uint8)
     for start in range(0, len(heights), MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, len(heights)))
@@ -190,21 +197,21 @@ def _labels(
 
 
 def _assignments(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: float) -> np.ndarray:
-    """What becomes of each window: [n] uint8, one of ASSIGNMENTS. known: [n] whether any trajectory is."""
-    assignment = np.full(len(known), TRAIN, np.uint8)
+    """Returns the Assignment of each window: [n] uint8. known: [n] bool, whether any trajectory is known."""
     asked = {split: _asked_for(split, config, windows, size) for split in ("validation", "test")}
-    assignment[~known] = TOO_UNKNOWN
-    assignment[known & asked["test"]] = TEST
-    assignment[(assignment == TRAIN) & _near(windows, assignment == TEST, size, size + config.gap - TOLERANCE)] = (
-        NEAR_TEST
-    )
-    assignment[(assignment == TRAIN) & asked["validation"]] = VALIDATION
-    assignment[(assignment == TRAIN) & _near(windows, assignment == VALIDATION, size, size + TOLERANCE)] = SHARED
+    assignment = np.full(len(known), Assignment.TRAIN, np.uint8)
+    assignment[~known] = Assignment.TOO_UNKNOWN
+    assignment[known & asked["test"]] = Assignment.TEST
+    near_test = _near(windows, assignment == Assignment.TEST, size, size + config.gap - TOLERANCE)
+    assignment[(assignment == Assignment.TRAIN) & near_test] = Assignment.NEAR_TEST
+    assignment[(assignment == Assignment.TRAIN) & asked["validation"]] = Assignment.VALIDATION
+    touching = _near(windows, assignment == Assignment.VALIDATION, size, size + TOLERANCE)
+    assignment[(assignment == Assignment.TRAIN) & touching] = Assignment.SHARED
     return assignment
 
 
 def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: float) -> np.ndarray:
-    """Windows of sites for that split and windows in its strips: [n] bool."""
+    """Tells which windows belong to sites of that split or lie in its strips: [n] bool."""
     asked = np.zeros(len(windows.site), bool)
     for index, site in enumerate(config.site):
         members = windows.site == index
@@ -214,7 +221,7 @@ def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: floa
 
 
 def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
-    """Which windows [n, 2] of a site lie wholly in a strip along the outermost of them: [n] bool."""
+    """Tells which windows [n, 2] of a site lie wholly in a strip along the outermost of them: [n] bool."""
     if not strip:
         return np.zeros(len(origin), bool)
     side, metres = strip
@@ -224,7 +231,7 @@ def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
 
 
 def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -> np.ndarray:
-    """Which windows have one of the `others` [n] bool on the same ground within reach: [n] bool.
+    """Tells which windows have one of the `others` [n] bool on the same ground within reach: [n] bool.
 
     size:  of a window
     reach: between the south-west nodes along the axis in which they lie farther apart; the size is where windows touch
@@ -251,13 +258,12 @@ def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -
 def _records(
     config: SitesConfig, found: list[Windows], site: np.ndarray, assignment: np.ndarray
 ) -> tuple[SiteRecord, ...]:
-    names = dict(enumerate(SPLITS)) | LEFT_OUT
     read = ("sha256", "cell_size", "covered", "filled", "unknown")
 
     def records() -> Iterator[SiteRecord]:
         for index, windows in enumerate(found):
-            counts = np.bincount(assignment[site == index], minlength=len(ASSIGNMENTS)).tolist()
-            assignments = {names[one]: count for one, count in enumerate(counts)}
+            counts = np.bincount(assignment[site == index], minlength=len(Assignment)).tolist()
+            assignments = {one.name.lower(): count for one, count in zip(Assignment, counts, strict=True)}
             as_read: dict[str, Any] = {name: getattr(windows, name) for name in read}
             as_read["crs"] = ", ".join(dict.fromkeys(windows.systems())) or None
             as_read["height_offset"] = windows.height_offset if isinstance(windows.height_offset, float) else None

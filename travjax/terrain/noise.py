@@ -32,7 +32,7 @@ the diagonal x + y = 1 of the cell those at 4 and 6, above it those at 5 and 7, 
 
 
 def permutations(seeds) -> np.ndarray:
-    """The permutation of each seed as the `opensimplex` package shuffles it: [n, 256] uint8 for n integers."""
+    """Shuffles the permutation of each seed as the `opensimplex` package does: [n, 256] uint8 for n integers."""
     state = np.asarray(seeds, np.int64)
     multiplier, increment = np.int64(6364136223846793005), np.int64(1442695040888963407)
     each = np.arange(len(state))
@@ -57,7 +57,7 @@ def permutation_table() -> jax.Array:
 
 @usual_flags()
 def noise2(seed, x: Float[Array, "*s"], y: Float[Array, "*s"]) -> Float[Array, "..."]:
-    """Noise in [-1, 1] at points (x, y): [...] for one integer seed, [n, ...] for n seeds.
+    """Returns noise in [-1, 1] at points (x, y): [...] for one integer seed, [n, ...] for n seeds.
 
     Agrees with `OpenSimplex(seed).noise2` to 1e-5 where |x|, |y| < 32. Raises InputError unless the seeds are integers.
     """
@@ -76,7 +76,7 @@ def _noise_of_permutations(tables, x, y):
 
 
 def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, " cols"], y: Float[Array, " rows"], reach: float):
-    """Noise on the grid of the axes x and y, all within [-reach, reach]: [rows, cols].
+    """Returns noise on the grid of the axes x and y, all within [-reach, reach]: [rows, cols].
 
     Codes of the lattice cells are computed first where they are fewer than the points.
     """
@@ -102,7 +102,7 @@ def cell_codes(permutation: Int[Array, "256"], i: Int[Array, "*s"], j: Int[Array
 
 
 def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
-    """Noise at points, given a function from cell indices (i, j) to the cells' codes."""
+    """Returns noise at points, given a function from cell indices (i, j) to the cells' codes."""
     skew = rounded((x + y) * SKEW)  # else a point beside a cell's edge would lie in one cell here, in another there
     i, j = jnp.floor(x + skew), jnp.floor(y + skew)
     inside_x, inside_y = x + skew - i, y + skew - j
@@ -117,7 +117,7 @@ def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
 
 
 def _contribution(gradient, dx, dy, right, up):
-    """What one vertex adds; gradients are (5, 2) with bit 0 swapping, bit 1 and bit 2 negating x and y."""
+    """Returns what one vertex adds; gradients are (5, 2) with bit 0 swapping, bit 1 and bit 2 negating x and y."""
     dx, dy = dx - right - (right + up) * UNSKEW, dy - up - (right + up) * UNSKEW
     reach = jnp.maximum(2 - dx * dx - dy * dy, 0) ** 2
     swapped = (gradient & 1) != 0

@@ -143,7 +143,7 @@ _LIMITS = np.array(
 def generate_terrain(
     style: str | Sequence[str], seeds, *, grid: Grid = Grid(), world: float | None = None
 ) -> Float[Array, "n rows cols"]:
-    """Maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
+    """Makes maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
 
     style: one of STYLES, or a sequence with one for each seed; or rock_field.STYLE for all of them
     seeds: integers in [0, 2^32): a sequence, a range or one number
@@ -160,7 +160,9 @@ def generate_terrain(
 
 @usual_flags()
 def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int[Array, " n"]]:
-    """The parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and errors."""
+    """Draws the parameters [n] and noise seeds [n] of the maps that `generate_terrain` makes; same arguments and
+    errors.
+    """
     styles, numbered = _styles_and_seeds(style, seeds, STYLES)
     index = np.array([STYLES.index(name) for name in styles], np.uint32)
     values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbered.astype(np.uint32)))
@@ -217,7 +219,7 @@ def require_world(world: float | None) -> None:
 def elevation(
     params: TerrainParams, noise_seed, *, grid: Grid = Grid(), world: float | None = None
 ) -> Float[Array, "*n rows cols"]:
-    """Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
+    """Evaluates Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
 
     noise_seed: an integer in [0, 10000), or [n] of them; these and the parameters are looked at, so not under `jit`
     world:      metres, the map size M from which features are derived; the grid's own unless given. Maps of one world
