@@ -137,7 +137,7 @@ def test_a_model_and_a_data_set_may_be_given(whole, preset, trained, tmp_path):
 
 def test_without_real_maps_it_runs_on_stand_ins_and_says_so_everywhere(trained, tmp_path, monkeypatch):
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
-    shutil.copy(find_preset("stand_in_sites", "transfer"), tmp_path)
+    shutil.copy(find_preset("stand_in", "sites"), tmp_path)
     (tmp_path / "sites.toml").write_text('stride = 8.0\n[[site]]\nfile = "quarry.npz"\n')
     (tmp_path / "tiny.toml").write_text(TOML)
     (tmp_path / "small.toml").write_text(PRESET.replace("[0, 1]", "[0]"))

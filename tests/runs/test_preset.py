@@ -11,14 +11,15 @@ from tests.small_training import PRESET, TOML
 from travjax.config import InputError, from_json, to_json
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.files import PRESETS
 from travjax.models.hazard_field import FieldConfig
+from travjax.models.names import MODELS
 from travjax.models.trajectory_resnet import HeadsConfig
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.simulation.actions import ActionSpace
 
-EXPERIMENTS = sorted((Path(__file__).parents[2] / "experiments/train").glob("*.toml"))
-FIELDS = sorted((Path(__file__).parents[2] / "experiments/field").glob("*.toml"))
+RESNETS, FIELDS = (sorted((PRESETS / model).glob("*.toml")) for model in MODELS)
 
 FIELD_TOML = """
 model = "field"
@@ -95,8 +96,8 @@ def test_a_preset_comes_back_from_json():
     assert from_json(to_json(PRESET), Preset) == PRESET
 
 
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_the_presets_of_the_repository_are_right(path):
+@pytest.mark.parametrize("path", RESNETS, ids=lambda path: path.stem)
+def test_the_presets_of_the_resnet_are_right(path):
     preset = Preset.load(path)
     steps = preset.dataset.maps * preset.training.each * preset.training.epochs / preset.training.batch_size
     assert preset.trunk.momentum == 0.9 or steps > 1000  # SPEC section 9
@@ -115,11 +116,11 @@ def test_the_presets_of_the_hazard_field_are_right(path):
 
 
 def test_both_models_have_the_same_presets():
-    assert [path.stem for path in FIELDS] == [path.stem for path in EXPERIMENTS] == ["laptop", "paper", "smoke"]
+    assert [path.stem for path in FIELDS] == [path.stem for path in RESNETS] == ["laptop", "paper", "smoke"]
 
 
 def test_there_is_a_preset_of_the_paper():
-    paper = Preset.load(next(path for path in EXPERIMENTS if path.stem == "paper"))
+    paper = Preset.load(next(path for path in RESNETS if path.stem == "paper"))
     assert replace(paper.training, checkpoint_steps=1) == TrainingConfig(checkpoint_steps=1)
     assert replace(paper.trunk, dtype="float32") == ResNetConfig()
     assert (paper.dataset, paper.heads, paper.evaluation) == (DatasetConfig(), HeadsConfig(), EvaluationConfig())

@@ -34,7 +34,7 @@ def add(commands: options.Commands) -> None:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper of experiments/train, or of experiments/field, or a .toml file (laptop)",
+        help="smoke, laptop or paper, or a .toml file (laptop)",
     )
     parser.add_argument("--model", choices=MODELS, help="the estimator: of a named preset, one of both (resnet50)")
     add_run(parser)
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
         require(given, "--coordinator, --processes, --process", shared, "all three or none")
         join(*shared)
     devices = Devices.all()
-    path = find_preset(arguments.preset, FOLDERS[arguments.model or RESNET])
+    path = find_preset(arguments.preset, arguments.model or RESNET)
     preset, data = Preset.load(path), arguments.data
     require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
     wanted = run_of(preset, arguments)

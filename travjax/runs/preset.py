@@ -1,4 +1,4 @@
-"""Everything that a training run is made from, as one TOML file (experiments/train/*.toml)."""
+"""Everything that a training run is made from, as one TOML file (presets/resnet50, presets/field)."""
 
 from dataclasses import dataclass
 from pathlib import Path
