@@ -201,7 +201,7 @@ def test_a_preset_is_found_by_its_path(tmp_path, monkeypatch):
         ("big", "resnet50", "preset big: no such resnet50 preset; allowed: laptop, paper, smoke, or a .toml file"),
         ("real", "field", "preset real: no such field preset; allowed: laptop, paper, smoke, or a .toml file"),
         ("../field/laptop", "field", "preset ../field/laptop: no such field preset; allowed: laptop, paper, smoke, or"),
-        ("laptop", "sites", "preset laptop: no such sites preset; allowed: real, real_upright, stand_in, or a .toml file"),
+        ("laptop", "sites", "preset laptop: no such sites preset; allowed: real, real_upright, stand_in, or a"),
     ],
 )
 def test_a_preset_that_is_not_there_is_one_line_that_lists_the_names(tmp_path, monkeypatch, given, kind, message):

@@ -62,7 +62,11 @@ def add_run(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     options.add_grid(parser)
-    parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
+    parser.add_argument(
+        "--weights",
+        metavar="FILE",
+        help="the trunk's first weights, or none for random ones (ImageNet's: TRAVJAX_DATA, the cache, else fetched)",
+    )
     parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
 
 
