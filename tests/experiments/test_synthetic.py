@@ -180,6 +180,6 @@ def test_an_experiment_does_not_go_on_with_another_preset(done, words, tmp_path)
 def test_missing_weights_are_one_line_and_leave_nothing(place, words, tmp_path, monkeypatch):
     monkeypatch.chdir(place)
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
-    said = refusal("tiny", *words, "--weights", "none.npz", "--out", tmp_path / "out")
+    said = refusal("tiny.toml", *words, "--weights", "none.npz", "--out", tmp_path / "out")
     assert said.startswith("weights none.npz: no such file here")
     assert files(tmp_path) == set()
