@@ -1,5 +1,6 @@
 """Files are written whole or not at all, and output folders are checked."""
 
+import re
 import signal
 import socket
 import subprocess
@@ -12,7 +13,7 @@ import pytest
 
 from travjax import files
 from travjax.config import InputError
-from travjax.files import atomic_write, atomic_write_folder, find_data, held, output_folder, save_npz
+from travjax.files import atomic_write, atomic_write_folder, find_data, find_preset, held, output_folder, save_npz
 
 
 def listing(folder) -> set[str]:
@@ -172,6 +173,42 @@ def test_missing_data_are_one_line_that_says_what_is_allowed(tmp_path, monkeypat
         find_data("a.tif", "map of the moon", "--map FILE")
     message = "map of the moon a.tif: no such file here, and TRAVJAX_DATA is not set; allowed: --map FILE"
     assert str(raised.value) == message
+
+
+# ---- Presets
+
+
+@pytest.mark.parametrize("kind", ["resnet50", "field", "transfer"])
+def test_a_preset_is_found_by_its_name_from_anywhere(tmp_path, monkeypatch, kind):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "laptop").touch()
+    assert find_preset("laptop", kind) == files.PRESETS / kind / "laptop.toml"
+    assert find_preset("laptop", kind).is_file()
+
+
+def test_a_preset_is_found_by_its_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "laptop.toml").touch()
+    for given in ("laptop.toml", "./laptop.toml", str(tmp_path / "laptop.toml"), tmp_path / "laptop.toml"):
+        assert find_preset(given, "field") == Path(given)
+    assert find_preset("~/laptop.toml", "field") == tmp_path / "laptop.toml"
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "message"),
+    [
+        ("big", "resnet50", "preset big: no such resnet50 preset; allowed: laptop, paper, smoke, or a .toml file"),
+        ("real", "field", "preset real: no such field preset; allowed: laptop, paper, smoke, or a .toml file"),
+        ("../field/laptop", "field", "preset ../field/laptop: no such field preset; allowed: laptop, paper, smoke, or"),
+        ("laptop", "sites", "preset laptop: no such sites preset; allowed: real, real_upright, stand_in, or a"),
+    ],
+)
+def test_a_preset_that_is_not_there_is_one_line_that_lists_the_names(tmp_path, monkeypatch, given, kind, message):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=f"^{re.escape(message)}") as raised:
+        find_preset(given, kind)
+    assert "\n" not in str(raised.value)
 
 
 # ---- What dead processes leave

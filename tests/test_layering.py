@@ -14,7 +14,8 @@ LAYERS = {
     "rasters": "coordinates reading_options memory formats raster gdal_files array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches npz_stream sensor_noise sampling provenance dataset_json dataset sites tfds_export",
-    "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights",
+    "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
+    "fetched_weights",
     "models": "names input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
     "simulator_benchmark",

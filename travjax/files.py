@@ -26,6 +26,9 @@ LOCK = ".travjax-lock"
 REPLACED = ".travjax-replaced"
 """Names of ours: of a folder for what is being written; in it, of its lock, and of what is replaced by two renames."""
 
+PRESETS = Path(__file__).parent / "presets"
+"""The presets that come with the package, in a folder for each kind."""
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
@@ -254,23 +257,17 @@ def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX
     raise InputError(f"{what} {name}: no such file here, {where}; allowed: {allowed}")
 
 
-def find_preset(given: str, experiment: str) -> Path:
-    """The file of a preset: `given` is a path, or a name such as "laptop" for experiments/EXPERIMENT/laptop.toml here.
+def find_preset(given: str | Path, kind: str) -> Path:
+    """Returns the file of a preset that is given by its path, or by a name such as "laptop" in PRESETS/KIND.
 
-    Raises InputError that lists the names when there is no such file.
+    Raises InputError, which lists the names, when there is no preset of that name. A path is not looked at.
     """
     if Path(given).suffix.lower() == ".toml":
-        if user_path(given).is_file():
-            return user_path(given)
-        raise InputError(f"preset {given}: no such file")
-    folder = Path("experiments") / experiment
-    path = folder / f"{given}.toml"
-    if path.is_file():
-        return path
-    names = ", ".join(sorted(found.stem for found in folder.glob("*.toml") if found.is_file()))
-    elsewhere = f"a .toml file, or a name in a folder where {folder} holds presets"
-    allowed = f"{names}, or a .toml file" if names else elsewhere
-    raise InputError(f"preset {given}: no {path} here; allowed: {allowed}")
+        return user_path(given)
+    presets = {path.stem: path for path in sorted((PRESETS / kind).glob("*.toml"))}
+    if str(given) not in presets:
+        raise InputError(f"preset {given}: no such {kind} preset; allowed: {', '.join(presets)}, or a .toml file")
+    return presets[str(given)]
 
 
 def sha256(path: Path) -> str:

@@ -336,7 +336,7 @@ def test_a_wrong_preset_is_one_line(tmp_path, words, line, other, message):
 
 def test_a_missing_preset_is_one_line(tmp_path):
     said = refusal(("train", tmp_path / "none.toml", "--out", tmp_path / "run"))
-    assert said == f"preset {tmp_path / 'none.toml'}: no such file"
+    assert said == f"{tmp_path / 'none.toml'}: cannot be read: No such file or directory"
 
 
 def test_a_data_set_of_another_robot_or_action_space_is_one_line(tmp_path, words):

@@ -2,15 +2,13 @@
 
 import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from travjax.config import InputError, from_json, to_json
 from travjax.data.provenance import LEAST_GAP, SIDES, Provenance, Site, SiteRecord, SitesConfig
-
-REPOSITORY = Path(__file__).parents[2]
+from travjax.files import find_preset
 
 TOML = """
 stride = 2
@@ -80,7 +78,7 @@ def test_sites_come_back_from_json():
 
 
 def test_the_sites_of_the_experiment_are_right():
-    config = SitesConfig.load(REPOSITORY / "experiments/transfer/sites.toml")
+    config = SitesConfig.load(find_preset("real", "sites"))
     splits = {site.group: site.split for site in config.site}
     trained = dict.fromkeys(("quarry", "rover_field", "alpine_pasture", "mars_marias_pass"), "train")
     assert splits == trained | {"mars_live_site": "test"}

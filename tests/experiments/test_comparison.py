@@ -27,11 +27,11 @@ from travjax.experiments.robustness_scores import (
     compare,
     sites_table,
 )
+from travjax.files import PRESETS
+from travjax.models.names import MODELS
 from travjax.runs.model_file import write_model
 from travjax.runs.predictor import Predictor
 from travjax.runs.preset import Preset
-
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
 
@@ -135,7 +135,7 @@ def test_the_report_says_what_the_scores_are_of(done):
 
 
 def test_maps_are_those_of_no_preset():
-    presets = [Preset.load(path) for folder in ("field", "train") for path in EXPERIMENTS.glob(f"{folder}/*.toml")]
+    presets = [Preset.load(path) for model in MODELS for path in (PRESETS / model).glob("*.toml")]
     sets = [DatasetConfig(200, comparison.SEED), DatasetConfig(50, comparison.SEED + 1)]
     ours, others = (
         [set(zip(config.styles().tolist(), config.seeds().tolist(), strict=True)) for config in configs]
@@ -256,10 +256,6 @@ def test_real_ground_alone_takes_no_times(model, sites, done, tmp_path):
 def test_without_the_sites_at_hand_synthetic_ground_is_left_and_a_line_says_why(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
     monkeypatch.chdir(tmp_path)
-    assert comparison._sites(None, "both") is None
-    said = capsys.readouterr().out
-    assert said.startswith("Synthetic ground alone: experiments/transfer/sites.toml: ") and said.count("\n") == 1
-    monkeypatch.chdir(EXPERIMENTS.parent)
     assert comparison._sites(None, "both") is None
     said = capsys.readouterr().out
     assert said.startswith("Synthetic ground alone: site quarry: file terrain/quarry.tif: no such file here")

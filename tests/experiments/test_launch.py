@@ -1,28 +1,11 @@
-"""How experiments start, find their presets and write their reports."""
-
-import re
-from pathlib import Path
+"""How experiments start and write their reports."""
 
 import pytest
 
 from travjax.config import InputError
 from travjax.experiments import launch
-from travjax.files import find_preset
 
 pytestmark = pytest.mark.usefixtures("compilation_cache")
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch) -> Path:
-    """A working folder with presets of an experiment."""
-    folder = tmp_path / "experiments/train"
-    folder.mkdir(parents=True)
-    for name in ("smoke.toml", "laptop.toml", "README.md"):
-        (folder / name).touch()
-    (folder / "folder.toml").mkdir()
-    (tmp_path / "laptop").touch()
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
 
 
 # ---- Starting
@@ -67,43 +50,6 @@ def test_help_names_the_module(capsys):
         started("--help")
     assert ended.value.code == 0
     assert capsys.readouterr().out.startswith("usage: python -m travjax.experiments.trial ")
-
-
-# ---- Presets
-
-
-def test_a_preset_is_found_by_its_name(here):
-    assert find_preset("laptop", "train") == Path("experiments/train/laptop.toml")
-
-
-def test_a_preset_is_found_by_its_path(here):
-    (here / "mine.toml").touch()
-    for given in ("mine.toml", str(here / "mine.toml"), "experiments/train/smoke.toml"):
-        assert find_preset(given, "train") == Path(given)
-
-
-@pytest.mark.parametrize(
-    ("given", "experiment", "message"),
-    [
-        ("big", "train", "preset big: no experiments/train/big.toml here; allowed: laptop, smoke, or a .toml file"),
-        (
-            "folder",
-            "train",
-            "preset folder: no experiments/train/folder.toml here; allowed: laptop, smoke, or a .toml file",
-        ),
-        ("none.toml", "train", "preset none.toml: no such file"),
-        ("experiments/train/folder.toml", "train", "preset experiments/train/folder.toml: no such file"),
-        (
-            "laptop",
-            "transfer",
-            "preset laptop: no experiments/transfer/laptop.toml here; allowed: a .toml file, or a name in a folder "
-            "where experiments/transfer holds presets",
-        ),
-    ],
-)
-def test_a_preset_that_is_not_there_is_one_line(here, given, experiment, message):
-    with pytest.raises(InputError, match=f"^{re.escape(message)}$"):
-        find_preset(given, experiment)
 
 
 # ---- Reports

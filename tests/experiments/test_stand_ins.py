@@ -32,7 +32,7 @@ def real(tmp_path, monkeypatch) -> Path:
     """A file of two real sites with the stand-ins described beside it, and no data."""
     monkeypatch.setenv("TRAVJAX_DATA", str(tmp_path / "data"))
     (tmp_path / "presets").mkdir()
-    shutil.copy(find_preset("stand_in_sites", "transfer"), tmp_path / "presets" / DESCRIPTION)
+    shutil.copy(find_preset("stand_in", "sites"), tmp_path / "presets" / DESCRIPTION)
     path = tmp_path / "presets" / "sites.toml"
     path.write_text(REAL)
     return path

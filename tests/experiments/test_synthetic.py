@@ -36,10 +36,9 @@ def run(*words) -> tuple[int, str, str]:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
-    """A working folder with the preset of the tests of training, experiments/train/tiny.toml."""
+    """A working folder with the preset of the tests of training, tiny.toml."""
     folder = tmp_path_factory.mktemp("place")
-    (folder / "experiments/train").mkdir(parents=True)
-    (folder / "experiments/train/tiny.toml").write_text(TOML)
+    (folder / "tiny.toml").write_text(TOML)
     return folder
 
 
@@ -61,10 +60,10 @@ def done(place, words, compilation_cache, shared_code) -> tuple[Path, str]:
     with contextlib.chdir(place):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(Trainer, "_step", interrupted)
-            code, _, err = run("tiny", *words)
+            code, _, err = run("tiny.toml", *words)
         assert code == 130 and err.endswith("travjax: interrupted; the same command goes on from there\n")
         assert not (place / "runs/synthetic/tiny/report.md").exists()
-        code, out, err = run("tiny", *words)
+        code, out, err = run("tiny.toml", *words)
     assert code == 0, err
     return place / "runs/synthetic/tiny", out
 
@@ -116,7 +115,7 @@ def test_a_finished_experiment_is_evaluated_again_and_not_trained(done, words, p
     folder = copy(done[0], tmp_path / "again")
     (folder / "report.md").unlink()
     monkeypatch.setattr(Trainer, "_step", lambda *arguments: pytest.fail("trained"))
-    code, _, err = run(place / "experiments/train/tiny.toml", *words, "--out", folder)
+    code, _, err = run(place / "tiny.toml", *words, "--out", folder)
     assert code == 0, err
     assert (folder / "report.md").read_text() == (done[0] / "report.md").read_text()
     assert loads((folder / "evaluation" / "evaluation.json").read_text()) == loads(
@@ -164,7 +163,7 @@ def refusal(*words) -> str:
 def test_a_preset_that_is_not_there_is_one_line(place, tmp_path, monkeypatch):
     monkeypatch.chdir(place)
     said = refusal("small", "--out", tmp_path / "out")
-    assert said == "preset small: no experiments/train/small.toml here; allowed: tiny, or a .toml file"
+    assert said == "preset small: no such resnet50 preset; allowed: laptop, paper, smoke, or a .toml file"
     assert files(tmp_path) == set()
 
 
@@ -181,6 +180,6 @@ def test_an_experiment_does_not_go_on_with_another_preset(done, words, tmp_path)
 def test_missing_weights_are_one_line_and_leave_nothing(place, words, tmp_path, monkeypatch):
     monkeypatch.chdir(place)
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
-    said = refusal("tiny", *words, "--weights", "none.npz", "--out", tmp_path / "out")
+    said = refusal("tiny.toml", *words, "--weights", "none.npz", "--out", tmp_path / "out")
     assert said.startswith("weights none.npz: no such file here")
     assert files(tmp_path) == set()

@@ -228,7 +228,7 @@ def test_the_processor_is_named_in_one_line(monkeypatch):
     [
         (("--repeats", 0), "--repeats = 0: must be at least 1"),
         (("--batch", 0), "--batch = 0: must be at least 1"),
-        (("--network", "none.toml"), "preset none.toml: no such file"),
+        (("--network", "none.toml"), "none.toml: cannot be read: "),
         (("--robot", "tank"), "robot"),
         (("--spacing", 1), "seekur_jr: spacing = 1: too coarse for Seekur Jr"),
     ],

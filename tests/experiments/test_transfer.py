@@ -2,19 +2,23 @@
 
 import contextlib
 import io
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.small_training import GRID, GRID_WORDS, TOML, copy, loads
+from travjax.config import InputError, to_json
 from travjax.data import sites
 from travjax.data.dataset import save
 from travjax.data.provenance import SitesConfig
 from travjax.experiments import transfer
-from travjax.experiments.transfer_runs import ARMS
+from travjax.experiments.transfer_runs import ARMS, TransferConfig
 from travjax.files import find_preset
+from travjax.runs.preset import TrainingConfig
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
 
@@ -137,7 +141,7 @@ def test_a_model_and_a_data_set_may_be_given(whole, preset, trained, tmp_path):
 
 def test_without_real_maps_it_runs_on_stand_ins_and_says_so_everywhere(trained, tmp_path, monkeypatch):
     monkeypatch.delenv("TRAVJAX_DATA", raising=False)
-    shutil.copy(find_preset("stand_in_sites", "transfer"), tmp_path)
+    shutil.copy(find_preset("stand_in", "sites"), tmp_path)
     (tmp_path / "sites.toml").write_text('stride = 8.0\n[[site]]\nfile = "quarry.npz"\n')
     (tmp_path / "tiny.toml").write_text(TOML)
     (tmp_path / "small.toml").write_text(PRESET.replace("[0, 1]", "[0]"))
@@ -179,6 +183,16 @@ def test_a_folder_of_another_preset_is_refused(whole, preset, tmp_path):
     before = (whole[1] / "results.json").read_text()
     assert "another preset" in refused(other, "--out", whole[1])
     assert (whole[1] / "results.json").read_text() == before
+
+
+def test_an_experiment_goes_on_when_the_files_that_its_preset_names_have_moved(tmp_path):
+    begun = TransferConfig("sites.toml", "../train/laptop.toml", training=TrainingConfig(head_epochs=0))
+    moved = replace(begun, sites="../sites/real.toml", synthetic="../resnet50/laptop.toml")
+    transfer._require_same(tmp_path, begun)
+    transfer._require_same(tmp_path, moved)
+    assert loads((tmp_path / "config.json").read_text()) == loads(json.dumps(to_json(moved)))
+    with pytest.raises(InputError, match="another preset"):
+        transfer._require_same(tmp_path, replace(moved, each=7))
 
 
 def test_a_data_set_for_another_robot_is_refused_with_both_named(preset, trained, tmp_path):

@@ -23,6 +23,7 @@ from tests.resnet.test_imagenet_weights import NARROW, canonical_arrays, keras_a
 from travjax.data.dataset import Dataset, DatasetConfig, load, save
 from travjax.data.dem import load_dem
 from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
+from travjax.files import find_preset
 from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.resnet.imagenet_weights import load_weights
 from travjax.runs.checkpoint import Checkpoints, load_meta
@@ -32,6 +33,7 @@ from travjax.runs.run import Run, load_estimator
 from travjax.runs.run_log import read_rows
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
+from travjax.simulation.robot import PRESETS as ROBOTS
 from travjax.simulation.robot import Robot
 from travjax.training.trainer import Position
 
@@ -39,7 +41,6 @@ from .worker import Format, Invalid
 
 GRID = Grid(4, 0.125)
 CELL = GRID.spacing
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def heights(holes: bool = True) -> np.ndarray:
@@ -204,14 +205,14 @@ def toml(name: str, text: Callable[[], str], load: Callable[[Path], object]) -> 
 
 
 CONFIGURATIONS = {
-    "robot": toml("robot.toml", (ROOT / "travjax/robots/seekur_jr.toml").read_text, Robot.load),
+    "robot": toml("robot.toml", (ROBOTS / "seekur_jr.toml").read_text, Robot.load),
     "actions": toml(
         "actions.toml",
         lambda: "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n",
         ActionSpace.load,
     ),
-    "preset": toml("preset.toml", (ROOT / "experiments/field/laptop.toml").read_text, Preset.load),
-    "sites": toml("sites.toml", (ROOT / "experiments/transfer/sites.toml").read_text, SitesConfig.load),
+    "preset": toml("preset.toml", find_preset("laptop", "field").read_text, Preset.load),
+    "sites": toml("sites.toml", find_preset("real", "sites").read_text, SitesConfig.load),
 }
 
 

@@ -1,6 +1,7 @@
 """Presets: what a TOML file gives, the one line for each wrong key or value, schedules and RMSprop."""
 
 import math
+import urllib.error
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -8,17 +9,19 @@ import numpy as np
 import pytest
 
 from tests.small_training import PRESET, TOML
-from travjax.config import InputError, from_json, to_json
+from travjax.config import InputError, from_json, one_line, to_json
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.files import PRESETS
 from travjax.models.hazard_field import FieldConfig
+from travjax.models.names import MODELS
 from travjax.models.trajectory_resnet import HeadsConfig
+from travjax.resnet.fetched_weights import KEPT
 from travjax.resnet.network import ResNetConfig
-from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
+from travjax.runs.preset import IMAGENET_WEIGHTS, EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.simulation.actions import ActionSpace
 
-EXPERIMENTS = sorted((Path(__file__).parents[2] / "experiments/train").glob("*.toml"))
-FIELDS = sorted((Path(__file__).parents[2] / "experiments/field").glob("*.toml"))
+RESNETS, FIELDS = (sorted((PRESETS / model).glob("*.toml")) for model in MODELS)
 
 FIELD_TOML = """
 model = "field"
@@ -95,8 +98,8 @@ def test_a_preset_comes_back_from_json():
     assert from_json(to_json(PRESET), Preset) == PRESET
 
 
-@pytest.mark.parametrize("path", EXPERIMENTS, ids=lambda path: path.stem)
-def test_the_presets_of_the_repository_are_right(path):
+@pytest.mark.parametrize("path", RESNETS, ids=lambda path: path.stem)
+def test_the_presets_of_the_resnet_are_right(path):
     preset = Preset.load(path)
     steps = preset.dataset.maps * preset.training.each * preset.training.epochs / preset.training.batch_size
     assert preset.trunk.momentum == 0.9 or steps > 1000  # SPEC section 9
@@ -115,11 +118,11 @@ def test_the_presets_of_the_hazard_field_are_right(path):
 
 
 def test_both_models_have_the_same_presets():
-    assert [path.stem for path in FIELDS] == [path.stem for path in EXPERIMENTS] == ["laptop", "paper", "smoke"]
+    assert [path.stem for path in FIELDS] == [path.stem for path in RESNETS] == ["laptop", "paper", "smoke"]
 
 
 def test_there_is_a_preset_of_the_paper():
-    paper = Preset.load(next(path for path in EXPERIMENTS if path.stem == "paper"))
+    paper = Preset.load(next(path for path in RESNETS if path.stem == "paper"))
     assert replace(paper.training, checkpoint_steps=1) == TrainingConfig(checkpoint_steps=1)
     assert replace(paper.trunk, dtype="float32") == ResNetConfig()
     assert (paper.dataset, paper.heads, paper.evaluation) == (DatasetConfig(), HeadsConfig(), EvaluationConfig())
@@ -288,6 +291,45 @@ def test_missing_weights_are_one_line_that_says_what_to_do(tmp_path, monkeypatch
     where = "nor under TRAVJAX_DATA=/nowhere" if data else "and TRAVJAX_DATA is not set"
     allowed = "allowed: --weights FILE, or none for random ones"
     assert str(raised.value) == f"weights imagenet/w.npz: no such file here, {where}; {allowed}"
+
+
+@pytest.fixture
+def empty(tmp_path, monkeypatch) -> Path:
+    """A working folder without weights, and no TRAVJAX_DATA; the cache is there as well."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("TRAVJAX_DATA", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def test_imagenet_weights_that_are_not_at_hand_come_from_the_cache(empty, monkeypatch):
+    kept = empty / "travjax" / KEPT
+    kept.parent.mkdir(parents=True)
+    kept.touch()
+    assert find_weights(IMAGENET_WEIGHTS) == kept
+    (empty / "data/imagenet").mkdir(parents=True)
+    (empty / "data" / IMAGENET_WEIGHTS).touch()
+    monkeypatch.setenv("TRAVJAX_DATA", str(empty / "data"))
+    assert find_weights(IMAGENET_WEIGHTS) == empty / "data" / IMAGENET_WEIGHTS
+
+
+def test_offline_one_line_names_the_ways_to_get_them(empty, monkeypatch):
+    def urlopen(address, timeout):
+        raise urllib.error.URLError("Network is unreachable")
+
+    monkeypatch.setattr("urllib.request.urlopen", urlopen)
+    with pytest.raises(InputError) as raised:
+        find_weights(IMAGENET_WEIGHTS)
+    said = one_line(raised.value)
+    assert said.startswith(f"weights {IMAGENET_WEIGHTS}: neither here nor under TRAVJAX_DATA, and not to be fetched: ")
+    for part in (
+        "Network is unreachable; allowed: ",
+        "--weights FILE (make train WEIGHTS=FILE) fetched elsewhere, as travjax weights --from FILE writes it",
+        "or TRAVJAX_DATA with this file; --weights none; ",
+    ):
+        assert part in said
+    assert said.endswith("; --model field (make train MODEL=field) needs none")
+    assert find_weights("none") is None
 
 
 def test_every_setting_is_explained():

@@ -13,7 +13,16 @@ from travjax.data import sites, tfds_export
 from travjax.data.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
 from travjax.data.provenance import SIDES, Site, SitesConfig, Strip
 from travjax.evaluation.dataset_tables import COLUMNS, statistics_table, windows_table
-from travjax.files import first_lines, output_folder, put_back, require_replaceable, resolved, save_text, user_path
+from travjax.files import (
+    find_preset,
+    first_lines,
+    output_folder,
+    put_back,
+    require_replaceable,
+    resolved,
+    save_text,
+    user_path,
+)
 from travjax.rasters.reading_options import DemOptions
 from travjax.simulation import traverse
 from travjax.simulation.actions import ActionSpace
@@ -66,7 +75,7 @@ def add(commands: options.Commands) -> None:
 def _add_real(parser: argparse.ArgumentParser) -> None:
     config = SitesConfig((Site("none"),))
     parser.add_argument(
-        "--sites", type=user_path, metavar="FILE", help="real maps: .toml file with a [[site]] for each elevation map"
+        "--sites", metavar="SITES", help="real maps: .toml file with a [[site]] for each elevation map, or real"
     )
     parser.add_argument("--dem", nargs="+", default=[], metavar="FILE", help="real maps: elevation maps to train on")
     parser.add_argument(
@@ -145,7 +154,8 @@ def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
         _require_left_out(arguments, SYNTHETIC, "DEM files are given")
     else:
         _require_left_out(arguments, REAL, "no DEM file is given")
-    real = SitesConfig.load(arguments.sites) if arguments.sites else _sites(arguments) if files else None
+    named = SitesConfig.load(find_preset(arguments.sites, "sites")) if arguments.sites else None
+    real = _sites(arguments) if files else named
     synthetic = None if real else DatasetConfig(*(getattr(arguments, name) for name in SYNTHETIC))
     grid, robot, actions = options.configuration(arguments)
     if real:

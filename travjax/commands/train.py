@@ -34,7 +34,7 @@ def add(commands: options.Commands) -> None:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper of experiments/train, or of experiments/field, or a .toml file (laptop)",
+        help="smoke, laptop or paper, or a .toml file (laptop)",
     )
     parser.add_argument("--model", choices=MODELS, help="the estimator: of a named preset, one of both (resnet50)")
     add_run(parser)
@@ -62,7 +62,11 @@ def add_run(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     options.add_grid(parser)
-    parser.add_argument("--weights", metavar="FILE", help="the trunk's first weights, or none for random ones")
+    parser.add_argument(
+        "--weights",
+        metavar="FILE",
+        help="the trunk's first weights, or none for random ones (ImageNet's: TRAVJAX_DATA, the cache, else fetched)",
+    )
     parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
 
 
@@ -94,7 +98,7 @@ def run(arguments: argparse.Namespace) -> None:
         require(given, "--coordinator, --processes, --process", shared, "all three or none")
         join(*shared)
     devices = Devices.all()
-    path = find_preset(arguments.preset, FOLDERS[arguments.model or RESNET])
+    path = find_preset(arguments.preset, arguments.model or RESNET)
     preset, data = Preset.load(path), arguments.data
     require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
     wanted = run_of(preset, arguments)

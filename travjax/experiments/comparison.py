@@ -38,7 +38,7 @@ from travjax.experiments.robustness_scores import (
     shown,
     sites_table,
 )
-from travjax.files import find_data, output_folder, save_text, user_path
+from travjax.files import find_data, find_preset, output_folder, save_text, user_path
 from travjax.models.names import FIELD, RESNET
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.predictor import Predictor
@@ -47,8 +47,8 @@ from travjax.training.step import LARGE_MARGIN
 
 SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
 
-SITES = Path("experiments/transfer/sites.toml")
-"""The real ground unless another is given."""
+SITES = "real"
+"""The preset of the real ground unless another is given."""
 
 SEED = 20_251_125
 """Of the test maps, the validation maps having the next one.
@@ -96,9 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument(
         "--sites",
-        type=user_path,
-        metavar="FILE",
-        help=f"TOML file of the real sites, whose splits play no part ({SITES}, where its files are found)",
+        metavar="SITES",
+        help=f"the real sites, whose splits play no part: a name or a .toml file ({SITES}, where its files are found)",
     )
     parser.add_argument("--windows", type=int, default=100, metavar="N", help="windows of a site, at most (100)")
     parser.add_argument(
@@ -162,12 +161,12 @@ def _load(option: str, source: Path | None, model: str) -> Predictor:
     return predictor
 
 
-def _sites(given: Path | None, ground: str) -> SitesConfig | None:
+def _sites(given: str | None, ground: str) -> SitesConfig | None:
     """The sites to compare on; None, and a line that says why, where those of the experiment are not at hand."""
     if ground == SYNTHETIC:
         return None
     try:
-        sites = SitesConfig.load(given or SITES)
+        sites = SitesConfig.load(find_preset(given or SITES, "sites"))
         for site in sites.site:
             find_data(site.file, f"site {site.group}: file")
     except InputError as error:

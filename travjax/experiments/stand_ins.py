@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DESCRIPTION = "stand_in_sites.toml"
+DESCRIPTION = "stand_in.toml"
 """The stand-in sites and how they are split, beside the file of the real ones."""
 
 FOLDER = "stand_ins"

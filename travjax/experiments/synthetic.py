@@ -1,6 +1,6 @@
 """`python -m travjax.experiments.synthetic`: the estimator on synthetic maps, the first half of the paper.
 
-Trains at a preset of experiments/train and evaluates on the test maps: the paper's first table beside ours, figures,
+Trains at a preset of the ResNet50 and evaluates on the test maps: the paper's first table beside ours, figures,
 and a report. The recorded runs are under experiments/synthetic.
 """
 
@@ -18,6 +18,7 @@ from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Eval
 from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import launch
 from travjax.files import find_preset, held, user_path
+from travjax.models.names import RESNET
 from travjax.runs.preset import Preset
 from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
@@ -42,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper of experiments/train, or a .toml file (laptop)",
+        help="smoke, laptop or paper, or a .toml file (laptop)",
     )
     train.add_run(options)
     options.add_argument(
@@ -53,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains as far as that is not done yet, evaluates, and writes the report."""
-    path = find_preset(arguments.preset, "train")
+    path = find_preset(arguments.preset, RESNET)
     wanted = train.run_of(Preset.load(path), arguments)
     folder = arguments.out or Path("runs/synthetic") / path.stem
     with held(folder), going_on(launch.GOES_ON):

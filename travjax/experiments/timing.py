@@ -19,6 +19,7 @@ from travjax.evaluation import map_figures, simulator_benchmark
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
 from travjax.files import atomic_write, find_preset, output_folder
+from travjax.models.names import RESNET
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.preset import Preset
 from travjax.simulation.actions import ActionSpace
@@ -63,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--network",
         metavar="PRESET",
-        help="preset of experiments/train, or a .toml file, whose network is measured (a ResNet50 in float32)",
+        help="preset of `travjax train`, or a .toml file, whose network is measured (a ResNet50 in float32)",
     )
     parser.add_argument(
         "--batch", type=int, default=BATCH, metavar="N", help=f"samples in the network at once ({BATCH})"
@@ -84,7 +85,7 @@ def run(arguments: argparse.Namespace) -> None:
     simulator_benchmark.check(robot, actions, grid)
     trunk = ResNetConfig()
     if arguments.network:
-        trunk = Preset.load(find_preset(arguments.network, "train")).trunk
+        trunk = Preset.load(find_preset(arguments.network, RESNET)).trunk
     out = output_folder(arguments.out)
     rows = _of_paper() if actions == ActionSpace() else []
     rows += measured(robot, actions, grid, trunk, arguments.batch, arguments.repeats)

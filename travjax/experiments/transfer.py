@@ -14,7 +14,7 @@ import numpy as np
 
 from travjax import progress
 from travjax.commands import evaluate, train
-from travjax.config import InputError, load_toml, read_text, require, to_json
+from travjax.config import InputError, load_toml, read_json, read_text, require, to_json
 from travjax.experiments import launch
 from travjax.files import find_preset, held, put_back, save_text, user_path
 from travjax.models.names import FIELD, MODELS, RESNET
@@ -35,7 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper of experiments/transfer, or a .toml file (laptop)",
+        help="smoke, laptop or paper, or a .toml file (laptop)",
     )
     parser.add_argument(
         "--model",
@@ -100,14 +100,23 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
 
 
 def _require_same(out: Path, config) -> None:
-    """Keeps the configuration in the folder, and refuses a folder with another one."""
+    """Keeps the configuration in the folder, and refuses a folder with another one; its FILES may have moved."""
     path = out / "config.json"
     text = json.dumps(to_json(config), indent=1) + "\n"
-    if path.exists() and read_text(path) != text:
+    if path.exists() and _without_files(read_json(path)) != _without_files(json.loads(text)):
         raise InputError(
             f"--out {out}: holds an experiment of another preset; allowed: another folder, or the same preset"
         )
     save_text(path, text)
+
+
+FILES = ("sites", "synthetic")
+"""What of a preset names other files; what these say is compared where the runs and their data set go on."""
+
+
+def _without_files(settings: Any) -> Any:
+    """Returns the settings of a preset without the names of its FILES."""
+    return {k: v for k, v in settings.items() if k not in FILES} if isinstance(settings, dict) else settings
 
 
 def _base(preset: Path, arguments: argparse.Namespace):

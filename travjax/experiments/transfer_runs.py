@@ -53,8 +53,8 @@ class TransferConfig:
     Files are named from the folder of the preset. Raises InputError that names field, value and what is allowed.
     """
 
-    sites: str = "sites.toml"
-    synthetic: str = "../train/laptop.toml"
+    sites: str = "../sites/real.toml"
+    synthetic: str = "../resnet50/laptop.toml"
     seeds: tuple[int, ...] = (0, 1, 2)
     each: int = 200
     shown: str = "mars_live_site"

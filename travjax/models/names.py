@@ -5,4 +5,4 @@ MODELS = (RESNET, FIELD)
 """Of one trajectory at a time, and of all trajectories of a map at once."""
 
 FOLDERS = {RESNET: "train", FIELD: "field"}
-"""Of each model's presets under experiments/, and of its runs under runs/."""
+"""Of each model's runs, under runs/; its presets lie in a folder of the model's name."""

@@ -1,22 +1,26 @@
-"""Everything that a training run is made from, as one TOML file (experiments/train/*.toml)."""
+"""Everything that a training run is made from, as one TOML file (presets/resnet50, presets/field)."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import optax
 
-from travjax.config import load_toml, require, require_length, require_number
+from travjax.config import InputError, load_toml, require, require_length, require_number
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.files import find_data
 from travjax.models.hazard_field import FieldConfig
 from travjax.models.names import FIELD, MODELS, RESNET
 from travjax.models.trajectory_resnet import HeadsConfig
+from travjax.resnet.fetched_weights import fetched_weights
 from travjax.resnet.network import ResNetConfig
 
 SCHEDULES = ("constant", "cosine")
 
 METHODS = ("rmsprop", "adamw")
+
+IMAGENET_WEIGHTS = "imagenet/resnet50_imagenet.npz"
+"""The name of ImageNet weights that may be any: where there is no such file, others are fetched."""
 
 MOST = 2**31 - 1
 """Of anything that is counted, and the largest seed."""
@@ -140,7 +144,8 @@ class Preset:
 
     model:           the estimator, one of MODELS
     robot:           a preset or a .toml file
-    weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones
+    weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones; where there
+                     is no file of the name IMAGENET_WEIGHTS, others are fetched
     elevation_scale: metres that count as 1 in the elevation channel
 
     The rest are the tables of the file: trunk and heads are those of the ResNet, field is the hazard field's, and so is
@@ -151,7 +156,7 @@ class Preset:
 
     model: str = RESNET
     robot: str = "seekur_jr"
-    weights: str = "imagenet/resnet50_imagenet.npz"
+    weights: str = IMAGENET_WEIGHTS
     elevation_scale: float = 1.0
     dataset: DatasetConfig = DatasetConfig()
     trunk: ResNetConfig = ResNetConfig()
@@ -178,5 +183,23 @@ class Preset:
 
 
 def find_weights(name: str) -> Path | None:
-    """The file of a preset's `weights`, None for "none"; raises InputError when there is none."""
-    return None if name == "none" else find_data(name, "weights", "--weights FILE, or none for random ones")
+    """Returns the file of a preset's `weights`, None for "none".
+
+    IMAGENET_WEIGHTS that are neither here nor under TRAVJAX_DATA are taken from the cache, or fetched.
+    Raises InputError when there is no such file, and it is not to be fetched.
+    """
+    if name == "none":
+        return None
+    try:
+        return find_data(name, "weights", "--weights FILE, or none for random ones")
+    except InputError:
+        if name != IMAGENET_WEIGHTS:
+            raise
+    try:
+        return fetched_weights()
+    except InputError as error:
+        raise InputError(
+            f"weights {name}: neither here nor under TRAVJAX_DATA, and not to be fetched: {error}; allowed: "
+            "--weights FILE (make train WEIGHTS=FILE) fetched elsewhere, as travjax weights --from FILE writes it, or "
+            "TRAVJAX_DATA with this file; --weights none; --model field (make train MODEL=field) needs none"
+        ) from None
