@@ -19,7 +19,7 @@ from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import unpacked
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 FIGURES = {"precision_recall.png", "reliability.png", "predictions.png"}
 BASELINES = ["heads on the frozen trunk", "regression on slope and step"]

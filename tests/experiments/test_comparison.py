@@ -33,7 +33,7 @@ from travjax.runs.preset import Preset
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 
 def run(*words) -> tuple[int, str, str]:

@@ -9,8 +9,6 @@ from travjax.config import InputError
 from travjax.experiments import launch
 from travjax.files import find_preset
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 
 @pytest.fixture
 def here(tmp_path, monkeypatch) -> Path:

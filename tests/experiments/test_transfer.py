@@ -16,7 +16,7 @@ from travjax.experiments.transfer_runs import ARMS
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 SITES = """
 max_unknown = 0.2
