@@ -38,6 +38,21 @@ hypothesis.settings.register_profile("travjax", deadline=None, max_examples=25, 
 hypothesis.settings.load_profile("travjax")
 
 
+LONGEST = [
+    *("commands/test_train.py", "simulation/test_traverse.py", "runs/test_predictor.py", "training/test_trainer.py"),
+    *("commands/test_evaluate.py", "resnet/test_convolution.py", "test_jax_flags.py", "test_cli.py"),
+    *("resnet/test_imagenet_weights.py", "terrain/test_styles.py", "experiments/test_transfer.py"),
+    *("resnet/test_network.py", "runs/test_checkpoint.py", "commands/test_dataset.py", "training/test_map_training.py"),
+]
+"""Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
+
+
+def place_of(item) -> int:
+    """Where the file of a test stands among LONGEST, or behind them."""
+    file = item.path.relative_to(Path(__file__).parent).as_posix()
+    return LONGEST.index(file) if file in LONGEST else len(LONGEST)
+
+
 def pytest_configure(config):
     if not hasattr(config, "workerinput"):  # workers of pytest-xdist, and programs that tests start, inherit the folder
         os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="travjax-tests-")
@@ -52,6 +67,7 @@ def pytest_unconfigure(config):
 
 
 def pytest_collection_modifyitems(items):
+    items.sort(key=place_of)
     if jax.default_backend() != "gpu":
         skip = pytest.mark.skip(reason=f"needs a GPU, and JAX runs on {jax.default_backend()} here")
         for item in items:
@@ -194,3 +210,13 @@ def trained(tmp_path_factory, few, shared_code) -> Path:
     (folder / "out.txt").write_text(out)
     (folder / "err.txt").write_text(err)
     return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def field(tmp_path_factory, shared_code) -> Path:
+    """The folder of a short run of a tiny hazard field."""
+    from tests.field_runs import begun
+
+    folder = tmp_path_factory.mktemp("field") / "run"
+    begun(folder, epochs=2).train()
+    return folder

@@ -12,6 +12,7 @@ from tests.small_training import GRID, HUSKY, dataset
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.devices import Devices
 from travjax.models.hazard_field import FieldConfig, HazardField, create
+from travjax.models.pose_stencil import Stencil
 from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
 from travjax.runs.run import Run
@@ -58,6 +59,16 @@ def random_variables(seed: int = 0):
 def estimator(seed: int = 0) -> HazardField:
     """A tiny one with random parameters and statistics, not to be changed."""
     return merge_model(*random_variables(seed))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _forward(graph, variables, elevation, stencil):
+    return merge_model(graph, variables)(elevation, stencil)
+
+
+def forward(field: HazardField, elevation, stencil: Stencil):
+    """Logits and margins, in one piece of code: the same operations one by one take seconds to compile."""
+    return _forward(*split_model(field), elevation, stencil)
 
 
 def trainer(folder: Path, run: Run = RUN, **training) -> FieldTrainer:
