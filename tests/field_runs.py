@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from tests import small_training
 from tests.commandline import FEW
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.data.sensor_noise import CorruptionConfig
@@ -25,7 +26,7 @@ PRESET = Preset(
     robot="husky_a200",
     weights="none",
     elevation_scale=0.1,
-    dataset=dataset().config,
+    dataset=small_training.PRESET.dataset,
     field=CONFIG,
     corruption=CorruptionConfig(0.5, 0.02, 0.2, 0.5),
     training=TrainingConfig(
