@@ -204,7 +204,7 @@ def toml(name: str, text: Callable[[], str], load: Callable[[Path], object]) -> 
 
 
 CONFIGURATIONS = {
-    "robot": toml("robot.toml", (ROOT / "travjax/robots/seekur_jr.toml").read_text, Robot.load),
+    "robot": toml("robot.toml", (ROOT / "travjax/simulation/robots/seekur_jr.toml").read_text, Robot.load),
     "actions": toml(
         "actions.toml",
         lambda: "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n",
