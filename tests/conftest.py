@@ -1,13 +1,17 @@
 """What the tests share: varied maps, settings of robot, actions and grid, and the `gpu` marker.
 
 Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
+
+Compiled code is kept in a folder that is new for each session and shared by its processes: most of the tests' time is
+XLA's, and it compiles many programs several times.
 """
 
 import math
 import os
+import shutil
 import signal
+import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -34,7 +38,36 @@ hypothesis.settings.register_profile("travjax", deadline=None, max_examples=25, 
 hypothesis.settings.load_profile("travjax")
 
 
+LONGEST = [
+    *("commands/test_train.py", "simulation/test_traverse.py", "runs/test_predictor.py", "training/test_trainer.py"),
+    *("commands/test_evaluate.py", "resnet/test_convolution.py", "test_jax_flags.py", "test_cli.py"),
+    *("resnet/test_imagenet_weights.py", "terrain/test_styles.py", "experiments/test_transfer.py"),
+    *("resnet/test_network.py", "runs/test_checkpoint.py", "commands/test_dataset.py", "training/test_map_training.py"),
+]
+"""Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
+
+
+def place_of(item) -> int:
+    """Where the file of a test stands among LONGEST, or behind them."""
+    file = item.path.relative_to(Path(__file__).parent).as_posix()
+    return LONGEST.index(file) if file in LONGEST else len(LONGEST)
+
+
+def pytest_configure(config):
+    if not hasattr(config, "workerinput"):  # workers of pytest-xdist, and programs that tests start, inherit the folder
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="travjax-tests-")
+    jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_unconfigure(config):
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
+
+
 def pytest_collection_modifyitems(items):
+    items.sort(key=place_of)
     if jax.default_backend() != "gpu":
         skip = pytest.mark.skip(reason=f"needs a GPU, and JAX runs on {jax.default_backend()} here")
         for item in items:
@@ -140,25 +173,6 @@ def setting(request) -> Setting:
     return SETTINGS[request.param]
 
 
-@contextmanager
-def cache_in(folder: Path) -> Iterator[Path]:
-    """Commands keep compiled code in the folder; JAX is as it was for other tests afterwards."""
-    settings = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
-    before = {name: getattr(jax.config, name) for name in (*settings, "jax_compilation_cache_dir")}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_COMPILATION_CACHE_DIR", str(folder))
-        yield folder
-    for name, value in before.items():
-        jax.config.update(name, value)
-
-
-@pytest.fixture(scope="module")
-def compilation_cache(tmp_path_factory) -> Path:
-    """Keeps code that commands compile away from the user's own cache, and JAX as it was for other tests."""
-    with cache_in(tmp_path_factory.mktemp("cache")) as folder:
-        yield folder
-
-
 @pytest.fixture(scope="session")
 def few(tmp_path_factory) -> Path:
     """A small action space, commandline.FEW, as a TOML file."""
@@ -192,8 +206,17 @@ def trained(tmp_path_factory, few, shared_code) -> Path:
     from tests.small_training import files_of_run, train, words_of
 
     folder = tmp_path_factory.mktemp("trained")
-    with cache_in(folder / "cache"):
-        out, err = train((*words_of(files_of_run(folder), few), "--out", folder / "run"))
+    out, err = train((*words_of(files_of_run(folder), few), "--out", folder / "run"))
     (folder / "out.txt").write_text(out)
     (folder / "err.txt").write_text(err)
     return folder / "run"
+
+
+@pytest.fixture(scope="session")
+def field(tmp_path_factory, shared_code) -> Path:
+    """The folder of a short run of a tiny hazard field."""
+    from tests.field_runs import begun
+
+    folder = tmp_path_factory.mktemp("field") / "run"
+    begun(folder, epochs=2).train()
+    return folder

@@ -7,11 +7,13 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from tests import small_training
 from tests.commandline import FEW
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.devices import Devices
 from travjax.models.hazard_field import FieldConfig, HazardField, create
+from travjax.models.pose_stencil import Stencil
 from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
 from travjax.runs.run import Run
@@ -24,7 +26,7 @@ PRESET = Preset(
     robot="husky_a200",
     weights="none",
     elevation_scale=0.1,
-    dataset=dataset().config,
+    dataset=small_training.PRESET.dataset,
     field=CONFIG,
     corruption=CorruptionConfig(0.5, 0.02, 0.2, 0.5),
     training=TrainingConfig(
@@ -58,6 +60,16 @@ def random_variables(seed: int = 0):
 def estimator(seed: int = 0) -> HazardField:
     """A tiny one with random parameters and statistics, not to be changed."""
     return merge_model(*random_variables(seed))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _forward(graph, variables, elevation, stencil):
+    return merge_model(graph, variables)(elevation, stencil)
+
+
+def forward(field: HazardField, elevation, stencil: Stencil):
+    """Logits and margins, in one piece of code: the same operations one by one take seconds to compile."""
+    return _forward(*split_model(field), elevation, stencil)
 
 
 def trainer(folder: Path, run: Run = RUN, **training) -> FieldTrainer:

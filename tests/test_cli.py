@@ -30,8 +30,6 @@ from travjax.terrain.styles import FIELDS
 CELL = 0.0625
 SEEKUR_JR = Robot.load("seekur_jr")
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 
 # ---- Synthetic maps
 
@@ -671,7 +669,7 @@ def test_the_version_is_that_of_the_package(capsys):
 
 def program(*words, **environment) -> subprocess.CompletedProcess:
     """`python -m travjax words...` in a process of its own, with the environment that this one was started in."""
-    ours = {"JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"}  # set by the fixture above and by JAX
+    ours = {"JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"}  # set by conftest.py and by JAX
     variables = {"JAX_PLATFORMS": "cpu"} | {name: value for name, value in os.environ.items() if name not in ours}
     command = [sys.executable, "-m", "travjax", *map(str, words)]
     return subprocess.run(command, capture_output=True, text=True, timeout=100, env=variables | environment)

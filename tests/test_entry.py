@@ -9,7 +9,6 @@ from pathlib import Path
 import jax
 import pytest
 
-from tests.conftest import cache_in
 from travjax import entry
 from travjax.config import InputError, naming
 from travjax.signals import Terminated
@@ -158,11 +157,15 @@ def test_a_parser_says_what_is_wrong_in_one_line():
 @pytest.fixture
 def settings(tmp_path, monkeypatch):
     """A user without a cache of their own; JAX is put back."""
-    with cache_in(tmp_path / "unused"):
-        monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
-        jax.config.update("jax_compilation_cache_dir", None)
-        yield jax.config
+    thresholds = ("jax_persistent_cache_min_compile_time_secs", "jax_persistent_cache_min_entry_size_bytes")
+    before = {name: getattr(jax.config, name) for name in (*thresholds, "jax_compilation_cache_dir")}
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    for name, value in zip(before, (1.0, 0, None), strict=True):
+        jax.config.update(name, value)
+    yield jax.config
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 def test_compiled_code_is_kept_in_the_user_s_cache_however_small_it_is(settings, tmp_path):

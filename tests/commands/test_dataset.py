@@ -22,8 +22,6 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 GRID = Grid(4, 0.125)
 SMALL = ("--size", 4, "--spacing", 0.125)
 CONFIG = DatasetConfig(maps=40, seed=3, validation=0.2, test=0.1)

@@ -19,7 +19,7 @@ from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import unpacked
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 FIGURES = {"precision_recall.png", "reliability.png", "predictions.png"}
 BASELINES = ["heads on the frozen trunk", "regression on slope and step"]
@@ -46,6 +46,12 @@ def evaluated(folder: Path, trained: Path, *words) -> Run:
     """Without what takes time."""
     quick = ("--figure-maps", 0, "--no-baselines")
     return succeeds(folder, "evaluate", trained, "--data", trained.parent / "set", *quick, *words)
+
+
+@pytest.fixture(scope="module")
+def usual(trained, tmp_path_factory) -> Run:
+    """The sample and the checkpoint that are the preset's."""
+    return evaluated(tmp_path_factory.mktemp("usual"), trained)
 
 
 def results(done: Run) -> dict:
@@ -131,8 +137,8 @@ def test_nothing_that_is_no_number_is_in_the_json(trained, tmp_path):
 # ---- What is evaluated
 
 
-def test_the_sample_is_the_preset_s_unless_told_otherwise(trained, tmp_path):
-    found = results(evaluated(tmp_path, trained))["sample"]
+def test_the_sample_is_the_preset_s_unless_told_otherwise(usual, trained, tmp_path):
+    found = results(usual)["sample"]
     assert (found["samples"], found["maps"], found["checkpoint"]) == (24, 4, "best")
     found = results(evaluated(tmp_path, trained, "--each", 3))["sample"]
     assert (found["samples"], found["maps"]) == (12, 4)
@@ -140,14 +146,13 @@ def test_the_sample_is_the_preset_s_unless_told_otherwise(trained, tmp_path):
     assert (found["samples"], found["maps"]) == (12, 2)
 
 
-def test_the_same_again_is_the_same(trained, tmp_path):
-    one, other = (evaluated(tmp_path / name, trained) for name in ("one", "other"))
-    assert results(one) == results(other)
+def test_the_same_again_is_the_same(usual, trained, tmp_path):
+    assert results(evaluated(tmp_path, trained)) == results(usual)
 
 
-def test_the_best_checkpoint_is_that_of_the_run(trained, tmp_path):
+def test_the_best_checkpoint_is_that_of_the_run(usual, trained):
     wanted = load_meta(trained / "checkpoints", "best")["position"]
-    sample = results(evaluated(tmp_path, trained))["sample"]
+    sample = results(usual)["sample"]
     assert (sample["phase"], sample["steps"]) == (wanted["phase"], wanted["total"])
 
 
@@ -171,8 +176,11 @@ def test_a_run_without_a_first_phase_has_one_baseline(tmp_path):
 
 
 def test_more_maps_can_be_drawn_than_there_are(trained, tmp_path):
-    words = ("--data", trained.parent / "set", "--no-baselines", "--figure-maps", 50)
-    done = succeeds(tmp_path, "evaluate", trained, *words)
+    split = dataset().split.copy()
+    split[dataset().maps_of("test")[1:]] = split.min()
+    save(replace(dataset(), split=split), tmp_path / "set")
+    words = ("--data", tmp_path / "set", "--no-baselines", "--figure-maps", 2)
+    done = succeeds(tmp_path / "out", "evaluate", trained, *words)
     assert (done.folder / "predictions.png").stat().st_size > 1000
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.commandline import FEW, files, run_words
-from tests.field_runs import CONFIG, begun
+from tests.field_runs import CONFIG
 from tests.small_training import copy, dataset, host, require_equal
 from travjax.commands.export import card
 from travjax.models.trajectory_resnet import split_model
@@ -20,14 +20,6 @@ from travjax.runs.run import load_estimator
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 pytestmark = pytest.mark.usefixtures("shared_code")
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory) -> Path:
-    """The folder of a short run of a tiny hazard field."""
-    folder = tmp_path_factory.mktemp("field") / "run"
-    begun(folder, epochs=2).train()
-    return folder
 
 
 def exported(folder: Path, to: Path, *words) -> str:

@@ -19,8 +19,6 @@ from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.styles import STYLES, generate_terrain
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 SEED = 40
 COUNT = 10
 

@@ -34,7 +34,7 @@ from tests.small_training import (
 from travjax.data.dataset import ARRAYS, load, save
 from travjax.runs.run import Run
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 FEW_STEPS = TOML.replace("head_epochs = 2", "head_epochs = 1").replace("\nepochs = 2", "\nepochs = 1")
 FEW_STEPS = FEW_STEPS.replace("1e-3", "3e-5")  # RMSprop makes much of the last digits of small gradients

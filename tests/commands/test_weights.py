@@ -17,8 +17,6 @@ from tests.resnet.test_imagenet_weights import canonical_arrays, torchvision_arr
 from travjax import cli
 from travjax.resnet.imagenet_weights import HUB, describe, load_weights
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 
 @pytest.fixture(scope="module")
 def arrays() -> dict[str, np.ndarray]:

@@ -187,7 +187,6 @@ def test_the_command_prints_the_table_and_the_speed_up_and_writes_it_and_a_figur
     tmp_path, monkeypatch, restored_cache
 ):
     (tmp_path / "few.toml").write_text(FEW_TOML)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(simulator_benchmark, "BATCHES", (1, 32))
     monkeypatch.setattr(simulator_benchmark, "start_row", lambda: simulator_benchmark._row("start", 1, 2.0, 0, None, 3))
     folder = tmp_path / "out"
@@ -220,7 +219,6 @@ def test_the_command_prints_the_table_and_the_speed_up_and_writes_it_and_a_figur
 @pytest.mark.parametrize("text", ["radii = [inf, 0.2]", "turns = 2\nradii = [inf]\narc_lengths = [3.0, 3.0]"])
 def test_the_command_refuses_actions_that_do_not_fit_before_it_measures(tmp_path, monkeypatch, restored_cache, text):
     (tmp_path / "bad.toml").write_text(text)
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.setattr(simulator_benchmark, "start_row", lambda: pytest.fail("measured before it looked"))
     err = io.StringIO()
     with contextlib.redirect_stderr(err):

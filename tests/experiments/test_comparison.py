@@ -33,7 +33,7 @@ from travjax.runs.model_file import write_model
 from travjax.runs.predictor import Predictor
 from travjax.runs.preset import Preset
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 
 def run(*words) -> tuple[int, str, str]:

@@ -5,8 +5,6 @@ import pytest
 from travjax.config import InputError
 from travjax.experiments import launch
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 
 # ---- Starting
 

@@ -21,7 +21,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.training.trainer import Trainer
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 EVALUATION = [f"evaluation/{name}.png" for name in ("predictions", "precision_recall", "reliability")]
 TRAINING = ["training.png", "inputs.png"]
@@ -48,7 +48,7 @@ def words(few) -> tuple:
 
 
 @pytest.fixture(scope="module")
-def done(place, words, compilation_cache, shared_code) -> tuple[Path, str]:
+def done(place, words, shared_code) -> tuple[Path, str]:
     """The folder of an experiment that was interrupted in its second phase and went on, and what it printed then."""
     step = Trainer._step
 

@@ -22,8 +22,6 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.training import network_benchmark
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 GRID_WORDS = ("--size", 4, "--spacing", 0.125)
 PAPER = ["paper: sequential simulator", "paper: network"]
 OURS = ["sequential simulator", "batched simulator, 1 map", "batched simulator, 32 maps at once"]
@@ -42,7 +40,7 @@ def rows_of(folder: Path) -> list[dict]:
 
 
 @pytest.fixture(scope="module")
-def done(tmp_path_factory, few, compilation_cache) -> tuple[Path, str, str]:
+def done(tmp_path_factory, few) -> tuple[Path, str, str]:
     """A run with a small network: its folder and what it said."""
     folder = tmp_path_factory.mktemp("timing")
     (folder / "small.toml").write_text('weights = "none"\n[trunk]\nblocks = [1]\nwidth = 4\ndtype = "bfloat16"\n')

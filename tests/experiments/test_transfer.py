@@ -22,7 +22,7 @@ from travjax.runs.preset import TrainingConfig
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
 
-pytestmark = pytest.mark.usefixtures("compilation_cache", "shared_code")
+pytestmark = pytest.mark.usefixtures("shared_code")
 
 SITES = """
 max_unknown = 0.2

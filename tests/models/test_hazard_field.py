@@ -1,5 +1,6 @@
 """The hazard field: its read-out against a float64 loop over the poses, its head in NumPy, and batches."""
 
+import functools
 import math
 
 import jax
@@ -9,15 +10,25 @@ import pytest
 
 from tests.commandline import FEW
 from tests.conftest import SEEKUR_JR
-from tests.field_runs import CONFIG, estimator, random_variables
+from tests.field_runs import CONFIG, estimator, forward, random_variables
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.config import InputError
-from travjax.models.hazard_field import FieldConfig, create, read_out
+from travjax.models.hazard_field import FieldConfig, HazardField, create, read_out
 from travjax.models.pose_stencil import Stencil, nodes_at, stencil
-from travjax.models.trajectory_resnet import merge_model
+from travjax.models.trajectory_resnet import merge_model, split_model
 from travjax.runs.map_samples import MapSource, relative
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def channels_of(graph, variables, elevation):
+    return merge_model(graph, variables).trunk(elevation, False)
+
+
+def trunk(field: HazardField, elevation):
+    """The channels at all nodes."""
+    return channels_of(*split_model(field), elevation)
 
 
 def test_the_read_out_is_a_loop_over_the_poses_of_each_trajectory():
@@ -46,8 +57,8 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
     made, heights = estimator(), dataset().heights[:2]
     source = MapSource.from_maps(heights, HUSKY, FEW, GRID, 0.1)
     elevation = source.elevation(np.arange(2))
-    logits, margins = map(np.asarray, made(elevation, source.stencil))
-    channels = np.asarray(made.trunk(elevation, False), np.float64).reshape(2, -1, CONFIG.channels)
+    logits, margins = map(np.asarray, forward(made, elevation, source.stencil))
+    channels = np.asarray(trunk(made, elevation), np.float64).reshape(2, -1, CONFIG.channels)
     heads = made.heads
     exact = lambda layer: [np.asarray(v[...], np.float64) for v in (layer.kernel, layer.bias)]
     first, bias = np.asarray(heads.first.kernel[...], np.float64), np.asarray(heads.bias[...], np.float64)
@@ -70,25 +81,25 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
 
 def test_a_map_is_seen_the_same_in_any_batch():
     source = MapSource.from_maps(dataset().heights, HUSKY, FEW, GRID, 0.1)
-    together = estimator()(source.elevation(np.arange(5)), source.stencil)
+    together = forward(estimator(), source.elevation(np.arange(5)), source.stencil)
     for index in (0, 3):
-        alone = estimator()(source.elevation(np.array([index])), source.stencil)
+        alone = forward(estimator(), source.elevation(np.array([index])), source.stencil)
         for part, whole in zip(alone, together, strict=True):
             np.testing.assert_allclose(part[0], whole[index], atol=1e-5)
 
 
 def test_the_height_of_the_map_plays_no_part():
     source, raised = (MapSource.from_maps(dataset().heights[:1] + up, HUSKY, FEW, GRID, 0.1) for up in (0, 64))
-    low, high = (estimator()(one.elevation(np.array([0])), one.stencil)[0] for one in (source, raised))
+    low, high = (forward(estimator(), one.elevation(np.array([0])), one.stencil)[0] for one in (source, raised))
     np.testing.assert_allclose(low, high, atol=1e-3)
 
 
 def test_trajectories_of_a_few_first_arcs_are_those_of_all():
     source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
     table, elevation = source.stencil, source.elevation(np.array([0]))
-    whole = estimator()(elevation, table)[0].reshape(-1, table.second_arcs, 3)
+    whole = forward(estimator(), elevation, table)[0].reshape(-1, table.second_arcs, 3)
     some = np.array([1, 4])
-    part = estimator()(elevation, Stencil(table.nodes[some], table.first_poses, table.second_arcs))[0]
+    part = forward(estimator(), elevation, Stencil(table.nodes[some], table.first_poses, table.second_arcs))[0]
     np.testing.assert_allclose(part.reshape(whole[some].shape), whole[some], atol=1e-5)
 
 
@@ -102,7 +113,7 @@ def test_an_unknown_node_is_seen_as_the_nearest_known_one():
 @pytest.mark.parametrize("nodes", [32, 33, 34, 35])
 def test_maps_may_have_any_number_of_nodes(nodes):
     elevation = np.random.default_rng(0).normal(size=(1, nodes, nodes)).astype(np.float32)
-    channels = estimator().trunk(elevation, False)
+    channels = trunk(estimator(), elevation)
     assert channels.shape == (1, nodes, nodes, CONFIG.channels)
     np.testing.assert_array_equal(channels[..., -1], elevation)
 
@@ -127,7 +138,7 @@ def test_gradients_reach_every_parameter():
 def test_activations_may_be_bfloat16():
     config = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, dtype="bfloat16")
     source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
-    found = [create(c)(source.elevation(np.array([0])), source.stencil)[0] for c in (config, CONFIG)]
+    found = [forward(create(c), source.elevation(np.array([0])), source.stencil)[0] for c in (config, CONFIG)]
     assert found[0].dtype == jnp.float32
     np.testing.assert_allclose(*found, atol=0.2)
     assert (np.asarray(found[0]) != np.asarray(found[1])).any()

@@ -167,7 +167,7 @@ def normalised(count: int = 2, size: int = 64) -> np.ndarray:
 @pytest.fixture(scope="module")
 def keras_model():
     """Keras' own ResNet50 with random weights, biases and statistics."""
-    os.environ["KERAS_BACKEND"] = "jax"
+    os.environ["KERAS_BACKEND"] = "numpy"  # which compiles nothing
     keras = pytest.importorskip("keras")
     model = keras.applications.ResNet50(weights=None, input_shape=(64, 64, 3))
     random = np.random.default_rng(1)
@@ -202,7 +202,9 @@ def keras_stages(keras_model) -> dict[str, np.ndarray]:
     }
     outputs = {name: keras_model.get_layer(layer).output for name, layer in layers.items()}
     pixels = (normalised() * (255 * STD))[..., ::-1].astype(np.float32)
-    computed = keras.Model(keras_model.input, outputs)(pixels, training=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # Keras converts its arrays as NumPy 1 did
+        computed = keras.Model(keras_model.input, outputs)(pixels, training=False)
     return {name: np.asarray(array) for name, array in computed.items()}
 
 
@@ -218,7 +220,7 @@ def keras_weights(keras_model, tmp_path_factory) -> dict[str, Weights]:
     for top, model in (("with top", keras_model), ("without top", without_top)):
         numbered, grouped = folder / "numbered.weights.h5", folder / "grouped.h5"
         with warnings.catch_warnings(), h5py.File(grouped, "w") as file:
-            warnings.simplefilter("ignore", DeprecationWarning)  # Keras converts its arrays as NumPy 1 did
+            warnings.simplefilter("ignore", DeprecationWarning)  # as above
             model.save_weights(numbered)
             legacy_h5_format.save_weights_to_hdf5_group(file, model)
             model.save(folder / "whole.keras")

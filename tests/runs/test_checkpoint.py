@@ -65,6 +65,7 @@ def one_line(raised: pytest.ExceptionInfo) -> str:
 
 def run(script: str, *arguments, **options) -> subprocess.Popen:
     environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment["JAX_ENABLE_COMPILATION_CACHE"] = "false"  # XLA says things when it reads it
     command = [sys.executable, "-W", "error", "-c", textwrap.dedent(script), *map(str, arguments)]
     pipe = subprocess.PIPE
     return subprocess.Popen(command, env=environment, stdout=pipe, stderr=pipe, text=True, **options)

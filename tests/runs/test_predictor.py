@@ -10,7 +10,7 @@ import pytest
 
 import travjax
 from tests.commandline import FEW
-from tests.field_runs import RUN, begun, estimator
+from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY, copy, dataset, run_of
 from tests.small_training import estimator as resnet
 from travjax.config import InputError
@@ -31,14 +31,6 @@ from travjax.terrain.styles import STYLES, generate_terrain
 from travjax.training.evaluator import Evaluator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
-
-
-@pytest.fixture(scope="module")
-def field(tmp_path_factory):
-    """The folder of a short run of a tiny hazard field."""
-    folder = tmp_path_factory.mktemp("field") / "run"
-    begun(folder, epochs=1).train()
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -180,13 +180,13 @@ def trainer_samples(count: int = 32):
 
 def test_a_narrow_trunk_learns_32_samples_by_heart():
     made = create(replace(PRESET.trunk, width=8), HeadsConfig(16, dropout=0.0))
-    optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").optimizer(2, 300)
+    optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").optimizer(2, 150)
     graph, state = split_model(made)[0], state_of(made, 2, optimizer)
     samples = trainer_samples(32)
     failed, weight, put = failed_of(samples).astype(np.float32), np.ones(32, np.float32), jax.device_put(source())
     assert len(failed) == 32 and 0.2 < failed.any(axis=1).mean() < 0.9
     losses = []
-    for step in range(300):
+    for step in range(150):
         state, loss = update(
             state,
             (put, *samples),
