@@ -18,7 +18,7 @@ LAYERS = {
     "models": "names input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
     "simulator_benchmark",
-    "runs": "checkpoint preset map_samples inference run_log run model_file predictor",
+    "runs": "quiet_orbax checkpoint preset map_samples inference run_log run model_file predictor",
     "training": "trajectory_samples step trainer map_training evaluator network_benchmark",
     "commands": "options terrain label dataset weights train evaluate export predict bench",
     "experiments": "launch transfer_runs stand_ins robustness robustness_scores synthetic transfer timing comparison",
