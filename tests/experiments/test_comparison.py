@@ -14,6 +14,7 @@ from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY
 from travjax.data.dataset import DatasetConfig
 from travjax.data.provenance import SitesConfig
+from travjax.estimators.preset import Preset
 from travjax.evaluation import score_figures
 from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.experiments import comparison
@@ -29,7 +30,6 @@ from travjax.experiments.robustness_scores import (
 )
 from travjax.runs.model_file import write_model
 from travjax.runs.predictor import Predictor
-from travjax.runs.preset import Preset
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 

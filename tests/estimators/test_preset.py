@@ -11,10 +11,10 @@ from tests.small_training import PRESET, TOML
 from travjax.config import InputError, from_json, to_json
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.estimators.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.models.hazard_field import FieldConfig
 from travjax.models.trajectory_resnet import HeadsConfig
 from travjax.resnet.network import ResNetConfig
-from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.simulation.actions import ActionSpace
 
 EXPERIMENTS = sorted((Path(__file__).parents[2] / "experiments/train").glob("*.toml"))
