@@ -184,7 +184,7 @@ def few(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def shared_code() -> Iterator[None]:
     """Trainers of the same settings of the optimizer share compiled code."""
-    from travjax.runs.preset import TrainingConfig
+    from travjax.estimators.preset import TrainingConfig
 
     make, made = TrainingConfig.optimizer, {}
 

@@ -12,12 +12,12 @@ from tests.commandline import FEW
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.devices import Devices
+from travjax.estimators.preset import EvaluationConfig, Preset, TrainingConfig
 from travjax.models.hazard_field import FieldConfig, HazardField, create
 from travjax.models.pose_stencil import Stencil
-from travjax.models.trajectory_resnet import merge_model, split_model
-from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
+from travjax.models.variables import merge_model, split_model
 from travjax.runs.run import Run
-from travjax.training.map_training import FieldTrainer
+from travjax.training.trainer import Trainer
 
 CONFIG = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, momentum=0.5)
 
@@ -72,16 +72,16 @@ def forward(field: HazardField, elevation, stencil: Stencil):
     return _forward(*split_model(field), elevation, stencil)
 
 
-def trainer(folder: Path, run: Run = RUN, **training) -> FieldTrainer:
+def trainer(folder: Path, run: Run = RUN, **training) -> Trainer:
     """A trainer that has not begun."""
     folder.mkdir(parents=True, exist_ok=True)
     preset = replace(run.preset, training=replace(run.preset.training, **training))
     run = replace(run, preset=preset)
     run.save(folder)
-    return FieldTrainer(run, dataset(), folder, Devices.all(), quiet=True)
+    return Trainer(run, dataset(), folder, Devices.all(), quiet=True)
 
 
-def begun(folder: Path, **training) -> FieldTrainer:
+def begun(folder: Path, **training) -> Trainer:
     """A trainer that has begun with an estimator of `create`."""
     made = trainer(folder, **training)
     made.start(made.run.create(made.config.seed))

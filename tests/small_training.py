@@ -12,10 +12,11 @@ import numpy as np
 from tests.commandline import FEW, run_words
 from travjax.data.dataset import Dataset, DatasetConfig, generate, save
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import Estimator, HeadsConfig, create, merge_model, split_model
+from travjax.estimators.preset import EvaluationConfig, Preset, TrainingConfig
+from travjax.models.trajectory_resnet import Estimator, HeadsConfig, create
+from travjax.models.variables import merge_model, split_model
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.preset import EvaluationConfig, Preset, TrainingConfig
 from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
 from travjax.simulation.grid import Grid

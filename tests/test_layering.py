@@ -16,11 +16,12 @@ LAYERS = {
     "data": "dem map_batches npz_stream sensor_noise sampling provenance dataset_json dataset sites tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
     "fetched_weights",
-    "models": "names input_images trajectory_resnet pose_stencil hazard_field",
+    "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
     "simulator_benchmark",
-    "runs": "checkpoint preset map_samples inference run_log run model_file predictor",
-    "training": "trajectory_samples step trainer map_training evaluator network_benchmark",
+    "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
+    "runs": "quiet_orbax checkpoint run_log run model_file predictor evaluator",
+    "training": "step trainer network_benchmark",
     "commands": "options terrain label dataset weights train evaluate export predict bench",
     "experiments": "launch transfer_runs stand_ins robustness robustness_scores synthetic transfer timing comparison",
     "program": "cli",

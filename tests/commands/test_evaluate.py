@@ -14,7 +14,7 @@ from travjax.data.dataset import save
 from travjax.data.sampling import every_sample
 from travjax.evaluation import metrics
 from travjax.models.input_images import render_inputs
-from travjax.models.trajectory_resnet import split_model
+from travjax.models.variables import split_model
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import unpacked

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from travjax.models.names import MODELS
 
 from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY
 from travjax.data.dataset import DatasetConfig
 from travjax.data.provenance import SitesConfig
+from travjax.estimators.preset import Preset
 from travjax.evaluation import score_figures
 from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.experiments import comparison
@@ -28,10 +30,8 @@ from travjax.experiments.robustness_scores import (
     sites_table,
 )
 from travjax.files import PRESETS
-from travjax.models.names import MODELS
 from travjax.runs.model_file import write_model
 from travjax.runs.predictor import Predictor
-from travjax.runs.preset import Preset
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 

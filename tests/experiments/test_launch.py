@@ -5,7 +5,6 @@ import pytest
 from travjax.config import InputError
 from travjax.experiments import launch
 
-
 # ---- Starting
 
 

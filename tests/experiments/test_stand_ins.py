@@ -9,10 +9,10 @@ import pytest
 
 from travjax.config import InputError
 from travjax.data.dem import load_dem
+from travjax.estimators.preset import TrainingConfig
 from travjax.experiments.stand_ins import DESCRIPTION, StandIns, chosen_stand_ins
 from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
-from travjax.runs.preset import TrainingConfig
 from travjax.terrain.rock_field import SITES, site_heights
 
 CONFIG = TransferConfig(training=TrainingConfig(epochs=0))

@@ -13,6 +13,8 @@ from tests.small_training import HUSKY, PRESET, dataset, differing, require_equa
 from travjax.config import InputError
 from travjax.data.sampling import every_sample, natural_sample
 from travjax.devices import Devices
+from travjax.estimators import trajectory_estimator
+from travjax.estimators.preset import TrainingConfig
 from travjax.evaluation import metrics
 from travjax.experiments import transfer_runs
 from travjax.experiments.transfer_runs import (
@@ -25,11 +27,9 @@ from travjax.experiments.transfer_runs import (
     TransferConfig,
     run_all,
 )
-from travjax.runs.preset import TrainingConfig
+from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
-from travjax.training import trainer
-from travjax.training.evaluator import Evaluator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -54,14 +54,14 @@ def real():
 def frozen(trained, real, tmp_path_factory):
     """An experiment with frozen trunks, its rows, and how often features of samples were computed."""
     computed: list[str] = []
-    features_of, folder = trainer.features_of, tmp_path_factory.mktemp("frozen")
+    over_samples, folder = trajectory_estimator.over_samples, tmp_path_factory.mktemp("frozen")
 
-    def counted(*arguments):
-        computed.append("features")
-        return features_of(*arguments)
+    def counted(function, *arguments):
+        computed.extend(["features"] * (function is trajectory_estimator.sample_features))
+        return over_samples(function, *arguments)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "features_of", counted)
+        patch.setattr(trajectory_estimator, "over_samples", counted)
         made = Transfer(FROZEN, Run.load(trained), trained, real, folder, Devices.all())
         rows = run_all(made, lambda arm, seed: None)
     return made, rows, computed
@@ -178,14 +178,14 @@ def test_features_of_another_data_set_are_computed_anew(frozen, trained, real, t
 def test_a_damaged_file_of_features_counts_as_none(tmp_path, damage):
     path = tmp_path / "imagenet.npz"
     np.savez(path, dataset="this", training=np.zeros(3))
-    assert str(transfer_runs._kept_features(path)["dataset"]) == "this"
+    assert str(transfer_runs._read_features(path)["dataset"]) == "this"
     data = path.read_bytes()
     path.unlink()
     if damage == "a folder":
         path.mkdir()
     elif damage != "missing":
         path.write_bytes(b"\x93NUMPY" if damage == "no archive" else data[: len(data) // 2])
-    assert transfer_runs._kept_features(path) == {}
+    assert transfer_runs._read_features(path) == {}
 
 
 def test_scores_of_a_finished_run_that_are_damaged_are_one_line(frozen, trained, real, tmp_path):

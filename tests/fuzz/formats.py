@@ -23,12 +23,12 @@ from tests.resnet.test_imagenet_weights import NARROW, canonical_arrays, keras_a
 from travjax.data.dataset import Dataset, DatasetConfig, load, save
 from travjax.data.dem import load_dem
 from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
+from travjax.estimators.preset import Preset
 from travjax.files import find_preset
-from travjax.models.trajectory_resnet import merge_model, split_model
+from travjax.models.variables import merge_model, split_model
 from travjax.resnet.imagenet_weights import load_weights
 from travjax.runs.checkpoint import Checkpoints, load_meta
 from travjax.runs.model_file import read_model, write_model
-from travjax.runs.preset import Preset
 from travjax.runs.run import Run, load_estimator
 from travjax.runs.run_log import read_rows
 from travjax.simulation.actions import ActionSpace

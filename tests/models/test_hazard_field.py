@@ -13,10 +13,10 @@ from tests.conftest import SEEKUR_JR
 from tests.field_runs import CONFIG, estimator, forward, random_variables
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.config import InputError
+from travjax.estimators.map_samples import MapSource, relative
 from travjax.models.hazard_field import FieldConfig, HazardField, create, read_out
 from travjax.models.pose_stencil import Stencil, nodes_at, stencil
-from travjax.models.trajectory_resnet import merge_model, split_model
-from travjax.runs.map_samples import MapSource, relative
+from travjax.models.variables import merge_model, split_model
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 

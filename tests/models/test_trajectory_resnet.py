@@ -9,7 +9,8 @@ from flax import nnx
 
 from tests.small_training import PRESET, differing, estimator, features_of, forward, host, in_training, require_equal
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import VARIABLES, HeadsConfig, create, merge_model, split_model
+from travjax.models.trajectory_resnet import HeadsConfig, create
+from travjax.models.variables import VARIABLES, merge_model, split_model
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.traverse import EVENTS
@@ -65,13 +66,6 @@ def test_only_training_moves_the_running_statistics():
     require_equal(host(after_evaluation(graph, variables, IMAGES, jax.random.key(0))), host(variables))
     moved = differing(host(in_training(graph, variables, IMAGES, jax.random.key(0))[1]), host(variables))
     assert moved == {name for name in host(variables) if name.endswith(("/mean", "/var"))}
-
-
-def test_squares_are_those_of_the_dense_kernels():
-    heads = host(nnx.state(estimator().heads, nnx.Param))
-    kernels = [array.astype(np.float64) for name, array in heads.items() if name.endswith("kernel")]
-    assert len(kernels) == 6
-    assert float(estimator().heads.squares()) == pytest.approx(sum((kernel**2).sum() for kernel in kernels), rel=1e-5)
 
 
 # ---- Dropout

@@ -23,6 +23,7 @@ import pytest
 from travjax.config import InputError
 from travjax.runs import checkpoint
 from travjax.runs.checkpoint import Checkpoints, load_meta
+from travjax.runs.quiet_orbax import patient_loops
 
 
 def state_of(number: int) -> dict:
@@ -388,7 +389,7 @@ def test_writes_that_are_under_way_when_one_fails_end_before_what_they_wrote_is_
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     tasks, before = [], asyncio.get_event_loop_policy()
-    with checkpoint._patient_loops():
+    with patient_loops():
         loop = asyncio.new_event_loop()
         with pytest.raises(OSError):
             loop.run_until_complete(save())
@@ -408,7 +409,7 @@ def test_a_disk_without_room_is_found_before_arrays_are_written(tmp_path, monkey
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    monkeypatch.setattr(checkpoint, "_patient_loops", None)  # not reached
+    monkeypatch.setattr(checkpoint, "quiet_orbax", None)  # not reached
     with pytest.raises(InputError) as raised:
         checkpoints.save(2, state_of(2), meta_of(2))
     assert one_line(raised) == (

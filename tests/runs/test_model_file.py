@@ -14,7 +14,7 @@ from tests import small_training
 from tests.field_runs import RUN, estimator
 from tests.small_training import host, require_equal, run_of
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import merge_model, split_model
+from travjax.models.variables import merge_model, split_model
 from travjax.resnet.weight_files import open_arrays, write_safetensors
 from travjax.runs.model_file import read_model, write_model
 from travjax.runs.predictor import DEFAULT, WEIGHTS

@@ -17,18 +17,18 @@ from travjax.config import InputError
 from travjax.data.sampling import every_sample
 from travjax.data.sensor_noise import filled
 from travjax.devices import Devices
+from travjax.estimators.map_estimator import map_hazards
+from travjax.estimators.map_samples import MapSource
 from travjax.evaluation import metrics
-from travjax.models.trajectory_resnet import merge_model, split_model
+from travjax.models.variables import merge_model, split_model
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.inference import map_hazards
-from travjax.runs.map_samples import MapSource
+from travjax.runs.evaluator import Evaluator
 from travjax.runs.model_file import write_model
 from travjax.runs.predictor import DEFAULT, WEIGHTS, Predictor, predict
 from travjax.runs.run import Run, load_estimator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
 from travjax.terrain.styles import STYLES, generate_terrain
-from travjax.training.evaluator import Evaluator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 

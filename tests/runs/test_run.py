@@ -11,10 +11,11 @@ from tests.commandline import FEW
 from tests.small_training import GRID, HUSKY, PRESET, copy, host, loads, require_equal, run_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import create, split_model
+from travjax.estimators.preset import EvaluationConfig
+from travjax.models.trajectory_resnet import create
+from travjax.models.variables import split_model
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.preset import EvaluationConfig
-from travjax.runs.run import TRAINED, Run, load_estimator
+from travjax.runs.run import Run, load_estimator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -106,7 +107,7 @@ def test_the_template_has_the_shapes_of_the_state(phase):
     run = run_of()
     state = split_model(create(PRESET.trunk, PRESET.heads))[1]
     if phase:
-        trained = {name: state[name] for name in TRAINED[phase]}
+        trained = {name: state[name] for name in run.kind.phases[phase].trained}
         state = state | {"optimizer": PRESET.training.optimizer(phase, 9).init(trained)}
     sharding = Devices.all().everywhere
     template = run.template(phase, sharding)

@@ -33,20 +33,25 @@ from tests.small_training import (
 from travjax.config import InputError
 from travjax.data.sampling import balanced_subset, every_sample
 from travjax.devices import Devices
+from travjax.estimators.inference import probabilities
+from travjax.estimators.kind import Batch
+from travjax.estimators.trajectory_estimator import TrajectoryEstimator
 from travjax.evaluation import metrics
 from travjax.evaluation.score_figures import training_figure
 from travjax.models.input_images import ImageSource, render_inputs, trajectory_bank
-from travjax.models.trajectory_resnet import HeadsConfig, create, merge_model, split_model
+from travjax.models.trajectory_resnet import HeadsConfig, create
+from travjax.models.variables import merge_model, split_model
 from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
-from travjax.runs.inference import probabilities
-from travjax.runs.run import TRAINED, load_estimator
+from travjax.runs.run import load_estimator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.traverse import EVENTS, unpacked
-from travjax.training.step import update
+from travjax.training.step import StepSettings, update
 from travjax.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("shared_code")
+
+PHASES = TrajectoryEstimator.phases
 
 STEPS = 7
 """Steps of an epoch of PRESET."""
@@ -79,7 +84,7 @@ def refusal(call, *arguments, **options) -> str:
 
 def state_of(made, phase: int, optimizer) -> dict:
     variables = jax.tree.map(jax.numpy.array, split_model(made)[1])  # a step takes its state apart
-    return variables | {"optimizer": optimizer.init({name: variables[name] for name in TRAINED[phase]})}
+    return variables | {"optimizer": optimizer.init({name: variables[name] for name in PHASES[phase].trained})}
 
 
 def numpy_step(heads: dict, nu: dict, features, failed, weight, rate: float, decay: float) -> tuple[dict, dict, float]:
@@ -110,7 +115,7 @@ def numpy_step(heads: dict, nu: dict, features, failed, weight, rate: float, dec
 def test_steps_of_the_heads_are_those_of_numpy():
     made = create(PRESET.trunk, HeadsConfig(5, dropout=0.0), seed=3)
     optimizer = replace(PRESET.training, learning_rate=0.01).optimizer(1, 1)
-    graph, state = split_model(made)[0], state_of(made, 1, optimizer)
+    settings, state = StepSettings(split_model(made)[0], PHASES[1], optimizer, 0.05), state_of(made, 1, optimizer)
     heads = {name: array.astype(np.float64) for name, array in host(state["heads"]["heads"]).items()}
     nu = {name: np.zeros_like(array) for name, array in heads.items()}
     random = np.random.default_rng(0)
@@ -120,9 +125,7 @@ def test_steps_of_the_heads_are_those_of_numpy():
         weight = np.array([1, 1, 1, 1, 1, 0, 0, 0] if step == 1 else [1] * 8, np.float32)
         before = heads
         heads, nu, wanted = numpy_step(heads, nu, features.astype(float), failed, weight, 0.01, 0.05)
-        state, loss = update(
-            state, features, failed, weight, 0, step, graph=graph, phase=1, optimizer=optimizer, penalty=0.05
-        )
+        state, loss = update(state, Batch(features, failed, weight), 0, step, settings=settings)
         assert float(loss) == pytest.approx(wanted, rel=1e-5)
         actual = host(state["heads"]["heads"])
         for name, array in heads.items():
@@ -146,20 +149,10 @@ def test_rmsprop_adds_epsilon_outside_of_the_root():
 def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
     samples = tuple(index[:8] for index in trainer_samples())
     made, optimizer = estimator(2), PRESET.training.optimizer(2, 1)
-    graph, state = split_model(made)[0], state_of(made, 2, optimizer)
+    settings = StepSettings(split_model(made)[0], PHASES[2], optimizer, PRESET.training.weight_decay)
     weight = np.array([1, 1, 1, 1, 1, 1, 0, 0], np.float32)
-    moved, loss = update(
-        state,
-        (source(), *samples),
-        failed_of(samples).astype(np.float32),
-        weight,
-        11,
-        4,
-        graph=graph,
-        phase=2,
-        optimizer=optimizer,
-        penalty=PRESET.training.weight_decay,
-    )
+    batch = Batch((source(), *samples), failed_of(samples).astype(np.float32), weight)
+    moved, loss = update(state_of(made, 2, optimizer), batch, 11, 4, settings=settings)
     key = jax.random.fold_in(jax.random.key(11), 4)
     logits, after = in_training(*split_model(made), images_of(samples), key)
     wanted = (entropy(logits, failed_of(samples)) * weight).sum() / 6
@@ -183,22 +176,13 @@ def test_a_narrow_trunk_learns_32_samples_by_heart():
     optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").optimizer(2, 150)
     graph, state = split_model(made)[0], state_of(made, 2, optimizer)
     samples = trainer_samples(32)
-    failed, weight, put = failed_of(samples).astype(np.float32), np.ones(32, np.float32), jax.device_put(source())
+    failed = failed_of(samples).astype(np.float32)
+    batch = Batch((jax.device_put(source()), *samples), failed, np.ones(32, np.float32))
+    settings = StepSettings(graph, PHASES[2], optimizer)
     assert len(failed) == 32 and 0.2 < failed.any(axis=1).mean() < 0.9
     losses = []
     for step in range(150):
-        state, loss = update(
-            state,
-            (put, *samples),
-            failed,
-            weight,
-            0,
-            step,
-            graph=graph,
-            phase=2,
-            optimizer=optimizer,
-            penalty=0.0,
-        )
+        state, loss = update(state, batch, 0, step, settings=settings)
         losses.append(float(loss))
     assert losses[0] > 1.5
     assert losses[-1] < 0.02
@@ -239,13 +223,15 @@ def test_the_features_of_the_frozen_trunk_are_those_of_a_forward_pass(tmp_path):
         np.testing.assert_allclose(made.features[name], wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_features_of_another_run_of_the_same_trunk_may_be_set(tmp_path, monkeypatch):
+def test_features_of_another_run_of_the_same_trunk_may_be_given(tmp_path, monkeypatch):
     first = begun(tmp_path / "first", head_epochs=1, epochs=0)
     features = first.features
     first.train()
-    monkeypatch.setattr("travjax.training.trainer.features_of", None)  # what would compute them
-    second = begun(tmp_path / "second", head_epochs=1, epochs=0)
-    second.features = features
+    monkeypatch.setattr("travjax.estimators.trajectory_estimator.over_samples", None)  # what would compute them
+    (tmp_path / "second").mkdir()
+    run = run_of(head_epochs=1, epochs=0)
+    second = Trainer(run, dataset(), tmp_path / "second", Devices.all(), quiet=True, features=features)
+    second.start(run.create(second.config.seed))
     second.train()
     assert rows_of(tmp_path / "first") == rows_of(tmp_path / "second")
 
@@ -337,10 +323,15 @@ def test_an_epoch_takes_each_sample_once_and_in_another_order_each_time(tmp_path
     orders = []
     for phase, epoch in ((1, 0), (1, 1), (2, 0), (2, 1)):
         batches = list(made.data.batches(phase, epoch))
+        samples = made.data.samples(phase, epoch)
+        if phase == 2:  # from maps and trajectories to their places
+            numbers = (samples[0] * len(FEW) + samples[1]).tolist()
+            taken = [(batch.inputs[0] * len(FEW) + batch.inputs[1]).tolist() for batch in batches]
+            places = [[numbers.index(number) for number in numbers_of_batch] for numbers_of_batch in taken]
+            batches = [batch._replace(inputs=inputs) for batch, inputs in zip(batches, places, strict=True)]
         places, failed, weight = (np.concatenate(parts) for parts in zip(*batches, strict=True))
         assert len(batches) == STEPS == -(-count // 8) and weight.sum() == count
         assert sorted(places[weight > 0]) == list(range(count))
-        samples = made.data.samples(phase, epoch)
         np.testing.assert_array_equal(failed, failed_of((samples[0][places], samples[1][places])))
         orders.append(places.tolist())
     assert orders[0] != orders[1] and orders[2] != orders[3]
@@ -393,8 +384,8 @@ def test_the_loss_of_an_epoch_is_the_mean_over_its_samples(tmp_path):
     made = begun(tmp_path, head_epochs=1, epochs=1)
     step, losses = made._step, []
 
-    def kept(inputs, failed, weight):
-        losses.append((step(inputs, failed, weight), weight.sum()))
+    def kept(batch):
+        losses.append((step(batch), batch.weight.sum()))
         return losses[-1][0]
 
     made._step = kept
@@ -510,9 +501,8 @@ def test_a_run_without_checkpoints_cannot_go_on(tmp_path):
 def test_a_loss_that_is_no_number_stops_training_and_names_the_batch(tmp_path, total, where):
     made = begun(tmp_path)
     step = made._step
-    made._step = lambda inputs, failed, weight: step(
-        inputs, failed * np.float32("nan") if made.position.total == total else failed, weight
-    )
+    spoilt = lambda batch: batch._replace(targets=batch.targets * np.float32("nan"))
+    made._step = lambda batch: step(spoilt(batch) if made.position.total == total else batch)
     message = refusal(made.train)
     assert f"loss = nan in {where}" in message and "the last checkpoint is kept" in message
     if total == 20:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from travjax.data.sampling import Samples
     from travjax.evaluation.metrics import Evaluation
-    from travjax.runs.run import Network
-    from travjax.training.evaluator import Evaluator
+    from travjax.models.variables import Network
+    from travjax.runs.evaluator import Evaluator
 
 RECALLS = (0.9, 0.99)
 """Recalls that thresholds are found for, unless others are asked for."""
@@ -104,8 +104,8 @@ def evaluate(
     from travjax.data import dataset
     from travjax.devices import Devices
     from travjax.models.hazard_field import HazardField
+    from travjax.runs.evaluator import Evaluator
     from travjax.runs.run import DATA, load_estimator
-    from travjax.training.evaluator import Evaluator
 
     trained, estimator, meta = load_estimator(folder, checkpoint)
     evaluator = Evaluator.from_run(trained, dataset.load(data or folder / DATA), Devices.all())
@@ -203,7 +203,7 @@ def _write_tables(
 
 def _margin_errors(errors: np.ndarray) -> str:
     """One line on mean absolute errors [3]."""
-    from travjax.training.step import LARGE_MARGIN
+    from travjax.models.hazard_field import LARGE_MARGIN
 
     step, obstacle, tilt = errors
     return (

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from travjax.commands import options
 from travjax.config import InputError, read_text
+from travjax.estimators.names import FIELD
 from travjax.files import first_lines, require_replaceable, save_text, user_path
-from travjax.models.names import FIELD
 from travjax.progress import wrote
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from travjax.commands import label, options
 from travjax.config import require
 from travjax.data.map_batches import Batch, bytes_each, labelled, samples, title
 from travjax.data.npz_stream import NpzStream
+from travjax.estimators.names import ESTIMATORS
 from travjax.files import output_folder, save_text, user_path
-from travjax.models.names import MODELS
 from travjax.simulation.traverse import EVENTS
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def add(commands: options.Commands) -> None:
         metavar="C",
         help="folder of a training run, or .safetensors file of an estimator",
     )
-    parser.add_argument("--model", choices=MODELS, help="what the estimator must be")
+    parser.add_argument("--model", choices=ESTIMATORS, help="what the estimator must be")
     parser.add_argument("--robot", metavar="R", help="what the estimator must have been trained for")
     parser.add_argument(
         "--check",

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 from travjax import progress
 from travjax.commands import options
 from travjax.config import InputError, one_line, require
+from travjax.estimators.names import ESTIMATORS, RESNET
 from travjax.files import find_preset, held, output_folder, put_back, user_path
-from travjax.models.names import FOLDERS, MODELS, RESNET
 from travjax.signals import going_on
 
 if TYPE_CHECKING:
     from travjax.data.dataset import Dataset
     from travjax.devices import Devices
-    from travjax.runs.preset import Preset
+    from travjax.estimators.preset import Preset
     from travjax.runs.run import Run
     from travjax.training.trainer import Trainer
 
@@ -36,7 +36,7 @@ def add(commands: options.Commands) -> None:
         metavar="PRESET",
         help="smoke, laptop or paper, or a .toml file (laptop)",
     )
-    parser.add_argument("--model", choices=MODELS, help="the estimator: of a named preset, one of both (resnet50)")
+    parser.add_argument("--model", choices=ESTIMATORS, help="the estimator: of a named preset, one of both (resnet50)")
     add_run(parser)
     parser.add_argument(
         "--data", type=user_path, metavar="DIR", help="data set of `travjax dataset`, instead of one made by the preset"
@@ -90,7 +90,7 @@ def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
 def run(arguments: argparse.Namespace) -> None:
     """Trains."""
     from travjax.devices import Devices, join
-    from travjax.runs.preset import Preset
+    from travjax.estimators.preset import Preset
 
     shared = (arguments.coordinator, arguments.processes, arguments.process)
     if any(value is not None for value in shared):
@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> None:
     preset, data = Preset.load(path), arguments.data
     require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
     wanted = run_of(preset, arguments)
-    folder = arguments.out or Path("runs") / FOLDERS[preset.model] / path.stem
+    folder = arguments.out or Path("runs") / ESTIMATORS[preset.model].folder / path.stem
     with going_on("with --resume the same command goes on from the latest checkpoint"):
         train(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
     if devices.main:
@@ -131,10 +131,10 @@ def train(
 
 def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, resume: bool, option: str) -> None:
     """`train` in a folder that no other process uses."""
+    from travjax.estimators.preset import find_weights
     from travjax.resnet.imagenet_weights import load_weights
-    from travjax.runs.preset import find_weights
     from travjax.runs.run import has_checkpoints
-    from travjax.training.map_training import trainer_of
+    from travjax.training.trainer import Trainer
 
     preset = wanted.preset
     resumes = has_checkpoints(folder)
@@ -144,7 +144,7 @@ def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, r
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
     estimator = None if resumes else wanted.create(preset.training.seed, weights)
-    trainer = trainer_of(wanted)(wanted, _dataset(data, wanted, folder, devices), folder, devices)
+    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices)
     output_folder(folder)
     if devices.main:
         wanted.save(folder)
@@ -153,7 +153,7 @@ def _train(wanted: "Run", folder: Path, devices: "Devices", data: Path | None, r
         trainer.resume()
     else:
         trainer.start(estimator)
-        if devices.main and preset.model == RESNET:
+        if devices.main and wanted.kind.sees_images:
             progress.wrote(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:

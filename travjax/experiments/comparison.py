@@ -18,6 +18,7 @@ from typing import Any
 from travjax import progress
 from travjax.config import InputError, require, to_json
 from travjax.data.provenance import SitesConfig
+from travjax.estimators.names import FIELD, RESNET
 from travjax.evaluation import map_figures, metrics, score_figures, simulator_benchmark
 from travjax.evaluation.metrics import OVERALL
 from travjax.evaluation.tables import rows_table
@@ -39,11 +40,10 @@ from travjax.experiments.robustness_scores import (
     sites_table,
 )
 from travjax.files import find_data, find_preset, output_folder, save_text, user_path
-from travjax.models.names import FIELD, RESNET
+from travjax.models.hazard_field import LARGE_MARGIN
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.predictor import Predictor
 from travjax.simulation.traverse import EVENTS
-from travjax.training.step import LARGE_MARGIN
 
 SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
 

@@ -16,9 +16,8 @@ from travjax.data.map_batches import Batch, joined, labelled, synthetic_batches
 from travjax.data.provenance import SitesConfig
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
+from travjax.estimators.inference import Placed, probabilities
 from travjax.evaluation.metrics import NAMES, OVERALL, Confusion, average_precision, confusions
-from travjax.models.trajectory_resnet import split_model
-from travjax.runs.inference import logits_of, probabilities
 from travjax.runs.predictor import Predictor
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -168,9 +167,8 @@ def by_margins(margins: Float[np.ndarray, "n t 3"], robot: Robot) -> Fails:
 def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
     """Probabilities of an estimator for samples [k] of maps: [k, 3]; on_progress: is told of samples."""
     devices = Devices.all()
-    graph, variables = split_model(predictor.network)
-    variables, source = devices.replicate(variables), devices.replicate(predictor.run.source(maps))
-    return probabilities(logits_of(graph, variables, source, samples, devices, 64 * devices.mesh.size, on_progress))
+    placed = Placed.from_network(predictor.network, devices.replicate(predictor.run.source(maps)), devices)
+    return probabilities(predictor.run.kind.logits(placed, samples, 64 * devices.mesh.size, on_progress))
 
 
 def scores(fails: Fails, failed: Bool[np.ndarray, "*k 3"], threshold: float = 0.5) -> dict[str, Confusion]:

@@ -21,9 +21,9 @@ from travjax.experiments.robustness import (
     of_samples,
     scores,
 )
+from travjax.models.hazard_field import LARGE_MARGIN
 from travjax.runs.predictor import Predicted, Predictor
 from travjax.simulation.traverse import EVENTS
-from travjax.training.step import LARGE_MARGIN
 
 SIMULATOR, FILTERED = "simulator", "simulator, best filter"
 HAZARD, MARGINS, NETWORK = "hazard field", "hazard field, margins", "ResNet50"

@@ -14,12 +14,12 @@ from travjax.commands import train
 from travjax.commands.evaluate import evaluate
 from travjax.config import read_text
 from travjax.devices import Devices
+from travjax.estimators.names import RESNET
+from travjax.estimators.preset import Preset
 from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation
 from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import launch
 from travjax.files import find_preset, held, user_path
-from travjax.models.names import RESNET
-from travjax.runs.preset import Preset
 from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
 from travjax.signals import going_on

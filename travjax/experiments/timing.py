@@ -15,13 +15,13 @@ from travjax import progress
 from travjax.commands import options
 from travjax.config import require
 from travjax.devices import Devices
+from travjax.estimators.names import RESNET
+from travjax.estimators.preset import Preset
 from travjax.evaluation import map_figures, simulator_benchmark
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
 from travjax.files import atomic_write, find_preset, output_folder
-from travjax.models.names import RESNET
 from travjax.resnet.network import ResNetConfig
-from travjax.runs.preset import Preset
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot

@@ -15,9 +15,9 @@ import numpy as np
 from travjax import progress
 from travjax.commands import evaluate, train
 from travjax.config import InputError, load_toml, read_json, read_text, require, to_json
+from travjax.estimators.names import ESTIMATORS, FIELD, RESNET
 from travjax.experiments import launch
 from travjax.files import find_preset, held, put_back, save_text, user_path
-from travjax.models.names import FIELD, MODELS, RESNET
 from travjax.signals import going_on
 
 DESCRIPTION = (
@@ -39,7 +39,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--model",
-        choices=MODELS,
+        choices=ESTIMATORS,
         default=RESNET,
         help=f"{FIELD} takes the preset PRESET_field ({RESNET})",
     )
@@ -121,7 +121,7 @@ def _without_files(settings: Any) -> Any:
 
 def _base(preset: Path, arguments: argparse.Namespace):
     """The run of the synthetic model: that of the folder given, else that of the experiment."""
-    from travjax.runs.preset import Preset
+    from travjax.estimators.preset import Preset
     from travjax.runs.run import Run
 
     if not arguments.synthetic:
@@ -224,18 +224,18 @@ MEANING = (
 
 def _samples(transfer) -> str:
     """What an epoch is trained on."""
-    from travjax.training.trajectory_samples import TrainingData
+    from travjax.estimators.trajectory_samples import TrajectorySamples
 
     if transfer.base.preset.model == FIELD:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
-    return f"{TrainingData(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
+    return f"{TrajectorySamples(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
 def _maps_figure(transfer):
     """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
     from travjax.evaluation import map_figures
+    from travjax.runs.evaluator import Evaluator
     from travjax.simulation.traverse import unpacked
-    from travjax.training.evaluator import Evaluator
 
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.from_run(base, data, transfer.devices)

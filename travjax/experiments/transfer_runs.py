@@ -17,16 +17,15 @@ from travjax.config import InputError, require
 from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples, natural_sample
 from travjax.devices import Devices
+from travjax.estimators.preset import MOST, TrainingConfig, find_weights
 from travjax.files import output_folder, save_npz
 from travjax.jax_flags import key_of
-from travjax.models.names import FIELD
 from travjax.models.trajectory_resnet import Estimator, Heads, create
+from travjax.models.variables import Network
 from travjax.resnet.imagenet_weights import load_weights
 from travjax.runs.checkpoint import load_meta
-from travjax.runs.preset import MOST, TrainingConfig, find_weights
-from travjax.runs.run import Network, Run, checked_meta, has_checkpoints, load_estimator
+from travjax.runs.run import Run, checked_meta, has_checkpoints, load_estimator
 from travjax.runs.run_log import read_rows
-from travjax.training.map_training import trainer_of
 from travjax.training.trainer import Trainer
 
 ARMS = ("random", "ImageNet", "ImageNet + synthetic")
@@ -35,7 +34,7 @@ ARMS = ("random", "ImageNet", "ImageNet + synthetic")
 SCRATCH, IMAGENET, SYNTHETIC = ARMS
 
 FIELD_ARMS = (SCRATCH, "synthetic")
-"""Likewise of the hazard field, for which there are no ImageNet weights."""
+"""Likewise where no trunk is frozen in a first phase, as in the hazard field: there are no ImageNet weights for it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class Transfer:
     @property
     def arms(self) -> tuple[str, ...]:
         """What the runs begin with; the synthetic model is the last."""
-        return FIELD_ARMS if self.base.preset.model == FIELD else ARMS
+        return ARMS if 1 in self.base.kind.phases else FIELD_ARMS
 
     def run_of(self, arm: str, seed: int) -> Run:
         """What a run is made from: the synthetic model's settings, trained as the experiment says."""
@@ -165,15 +164,19 @@ class Transfer:
 
     def _train(self, arm: str, seed: int, place: Path) -> None:
         run = self.run_of(arm, seed)
-        trainer = trainer_of(run)(run, self.dataset, output_folder(place), self.devices, watched=self.held_out)
+        features = self._kept_features(arm)
+        trainer = Trainer(
+            run, self.dataset, output_folder(place), self.devices, watched=self.held_out, features=features
+        )
         if self.devices.main:
             run.save(place)
         if has_checkpoints(place):
             trainer.resume()
         else:
             trainer.start(self._first(arm, seed))
-        if self.config.frozen:
-            self._share_features(trainer, arm)
+        if self.config.frozen and features is None:
+            path = self._features_file(arm)
+            save_npz(output_folder(path.parent) / path.name, dataset=self.dataset.fingerprint, **trainer.features)
         trainer.train()
 
     def _first(self, arm: str, seed: int) -> Network:
@@ -181,7 +184,7 @@ class Transfer:
         preset = self.base.preset
         if arm == self.arms[-1]:
             return self.pretrained
-        if preset.model == FIELD:
+        if 1 not in self.base.kind.phases:
             return self.base.create(seed)
         file = find_weights(preset.weights) if arm == IMAGENET else None
         weights = load_weights(file, preset.trunk) if file else None
@@ -189,18 +192,18 @@ class Transfer:
         made = create(preset.trunk, preset.heads, trunk_seed, weights)
         return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(key_of(seed + 1))))
 
-    def _share_features(self, trainer: Trainer, arm: str) -> None:
-        """The features of a frozen trunk, kept in a file for its other seeds and for a run that goes on."""
-        path, fingerprint = self.folder / "features" / f"{_name(arm)}.npz", self.dataset.fingerprint
-        kept = _kept_features(path)
-        if str(kept.pop("dataset", None)) == fingerprint:
-            trainer.features = kept
-            return
-        save_npz(output_folder(path.parent) / path.name, dataset=fingerprint, **trainer.features)
+    def _features_file(self, arm: str) -> Path:
+        """Names the file of an arm's features, for its other seeds and for a run that goes on."""
+        return self.folder / "features" / f"{_name(arm)}.npz"
+
+    def _kept_features(self, arm: str) -> dict[str, np.ndarray] | None:
+        """Reads the features of an arm's frozen trunk on this data set; None where they are to be computed."""
+        kept = _read_features(self._features_file(arm)) if self.config.frozen else {}
+        return kept if str(kept.pop("dataset", None)) == self.dataset.fingerprint else None
 
 
-def _kept_features(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file of features; none where there is no file or it is damaged, since they can be made anew."""
+def _read_features(path: Path) -> dict[str, np.ndarray]:
+    """Reads the arrays of a file of features; none where it is missing or damaged, since they can be made anew."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return dict(file)

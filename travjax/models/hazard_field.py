@@ -31,6 +31,9 @@ COARSE = 5.0
 FIRST_LOGIT = -6.0
 """Of each pose, before training: failures are rare, and a trajectory has many poses."""
 
+LARGE_MARGIN = 4.0
+"""Limits; margins are not told apart from there on."""
+
 _he_normal = nnx.initializers.he_normal()
 
 

@@ -1,7 +1,6 @@
 """The estimator: a ResNet trunk and a head for each event (SPEC section 8)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +12,6 @@ from travjax.jax_flags import key_of, usual_flags
 from travjax.resnet.imagenet_weights import Weights, apply_weights
 from travjax.resnet.network import ResNet, ResNetConfig
 from travjax.simulation.traverse import EVENTS
-
-VARIABLES = ("trunk", "heads", "statistics")
-"""What training changes: parameters of trunk and heads, and the trunk's running means and variances."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +62,6 @@ class Heads(nnx.Module):
         heads = [getattr(self, event) for event in EVENTS]
         return jnp.stack([head(features, key) for head, key in zip(heads, keys, strict=True)], axis=-1)
 
-    def squares(self) -> Float[Array, ""]:
-        """Sum of the squares of the dense kernels."""
-        heads = [getattr(self, event) for event in EVENTS]
-        kernels = [layer.kernel[...] for head in heads for layer in (head.hidden, head.logit)]
-        return jnp.stack([jnp.sum(jnp.square(kernel)) for kernel in kernels]).sum()
-
 
 class Estimator(nnx.Module):
     """Images of map and trajectory to a logit for each event."""
@@ -109,19 +99,3 @@ def create(
         body = nnx.eval_shape(make)  # random numbers for a whole trunk take ten seconds to compile
         apply_weights(body, weights)
     return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(key_of(seed + 1))))
-
-
-def split_model(estimator: nnx.Module) -> tuple[nnx.GraphDef, dict[str, nnx.State]]:
-    """What is fixed of an estimator, and its VARIABLES."""
-    graph, *states = nnx.split(
-        estimator,
-        nnx.All(nnx.Param, nnx.PathContains("trunk")),
-        nnx.All(nnx.Param, nnx.PathContains("heads")),
-        nnx.BatchStat,
-    )
-    return graph, dict(zip(VARIABLES, states, strict=True))
-
-
-def merge_model(graph: nnx.GraphDef, variables: dict[str, nnx.State]) -> Any:
-    """The inverse of `split_model`; the estimator has variables of its own."""
-    return nnx.merge(graph, *(variables[name] for name in VARIABLES), copy=True)

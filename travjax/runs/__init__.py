@@ -1,5 +1,5 @@
 """A training run on disk and its use.
 
-In: a preset, the folder of a run or a file of a model. Out: checkpoints, the run's estimator, its predictions.
-Stands on Orbax, models/ and data/.
+In: a preset, the folder of a run or a file of a model. Out: checkpoints, the run's estimator, its predictions and
+scores. Stands on Orbax, estimators/ and evaluation/.
 """

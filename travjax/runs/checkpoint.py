@@ -10,28 +10,25 @@ A folder holds one sub-folder a checkpoint, numbered in the order they were save
 A checkpoint is written to a temporary folder and renamed: a kill at any moment leaves the earlier ones as they were.
 """
 
-import asyncio
 import errno
 import json
-import logging
 import os
 import re
 import shutil
 import textwrap
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-import uvloop
 from flax.traverse_util import unflatten_dict
 from jax.experimental import multihost_utils
 
 from travjax.config import InputError, require
 from travjax.files import sha256, user_path
+from travjax.runs.quiet_orbax import quiet_orbax
 
 FORMAT = 1
 UNFINISHED = ".unfinished-checkpoint"
@@ -115,7 +112,7 @@ class Checkpoints:
             _require_room(unfinished, sum(leaf.nbytes for leaf in arrays.values()) + len(text))
 
         def write_arrays() -> None:
-            with _quiet_orbax() as ocp:
+            with quiet_orbax() as ocp:
                 context = ocp.Context()
                 context.array.saving.use_compression = False  # saves 8 % of the space in seven times the time
                 with context:
@@ -268,7 +265,7 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
         blank = np.broadcast_to(np.zeros((), jax.numpy.dtype(dtype)), shape)
         abstract[name] = blank if sharding is None else jax.ShapeDtypeStruct(shape, blank.dtype, sharding=sharding)
     try:
-        with _quiet_orbax() as ocp:
+        with quiet_orbax() as ocp:
             arrays = ocp.load(path / "state", abstract)
     except MemoryError:
         raise
@@ -312,53 +309,3 @@ def _reason(error: Exception) -> str:
     if code := re.search(r"os_error_code='(\d+)'", str(error)):
         return os.strerror(int(code[1]))
     return textwrap.shorten(str(error), 200, placeholder=" ...")
-
-
-def _not_from_orbax(record: logging.LogRecord) -> bool:
-    return "orbax" not in Path(record.pathname).parts
-
-
-class _PatientLoop(asyncio.SelectorEventLoop):
-    """An event loop that ends no earlier than its tasks and threads.
-
-    Orbax closes its own at the first error, while others of its reads and writes are under way: they would go on, each
-    would print a traceback, and what is removed would be made again.
-    """
-
-    def close(self) -> None:
-        if not self.is_closed():
-            self.run_until_complete(self._finish())
-        super().close()
-
-    async def _finish(self) -> None:
-        others = asyncio.all_tasks() - {asyncio.current_task()}
-        await asyncio.gather(*others, return_exceptions=True)
-        await self.shutdown_default_executor()
-
-
-class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
-    _loop_factory = _PatientLoop
-
-
-@contextmanager
-def _patient_loops() -> Iterator[None]:
-    """Makes the loops of asyncio, and those of uvloop that Orbax runs beside one, patient ones."""
-    policy, new_event_loop = asyncio.get_event_loop_policy(), uvloop.new_event_loop
-    asyncio.set_event_loop_policy(_PatientPolicy())
-    uvloop.new_event_loop = lambda: _PatientLoop()  # type: ignore
-    try:
-        yield
-    finally:
-        asyncio.set_event_loop_policy(policy)
-        uvloop.new_event_loop = new_event_loop
-
-
-@contextmanager
-def _quiet_orbax() -> Iterator[Any]:
-    """Orbax with patient loops, without its warnings and its log; its threads also log each error that it raises."""
-    logging.getLogger("absl").addFilter(_not_from_orbax)  # adding it again changes nothing
-    with warnings.catch_warnings(), _patient_loops():
-        warnings.simplefilter("ignore")
-        from orbax.checkpoint import v1 as ocp
-
-        yield ocp

@@ -10,10 +10,10 @@ import jax
 import numpy as np
 
 from travjax.config import InputError
-from travjax.models.trajectory_resnet import merge_model, split_model
+from travjax.models.variables import Network, merge_model, split_model
 from travjax.resnet.stored_arrays import WeightFile, shown
 from travjax.resnet.weight_files import open_arrays, require_finite, write_safetensors
-from travjax.runs.run import Network, Run, named_leaves
+from travjax.runs.run import Run, named_leaves
 
 SUFFIX = ".safetensors"
 

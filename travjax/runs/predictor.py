@@ -1,6 +1,5 @@
 """Probabilities of failure for the whole action space, from maps alone, by a trained estimator."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,15 +7,13 @@ import numpy as np
 from jaxtyping import Float
 
 from travjax.config import InputError, require
-from travjax.data.sampling import Samples
 from travjax.devices import Devices
+from travjax.estimators.inference import NoNumbers, Placed, Progress, probabilities
 from travjax.files import user_path
 from travjax.jax_flags import usual_flags
-from travjax.models.trajectory_resnet import split_model
-from travjax.runs.inference import NoNumbers, hazards, logits_of, probabilities
-from travjax.runs.map_samples import MapSource
+from travjax.models.variables import Network
 from travjax.runs.model_file import SUFFIX, read_model
-from travjax.runs.run import Network, Run, load_estimator
+from travjax.runs.run import Run, load_estimator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
@@ -84,7 +81,7 @@ class Predictor:
             require(given in (None, own), name, given, f"{own}, which the estimator was trained for")
 
     @usual_flags()
-    def predict(self, heights: Heights, on_progress: Callable[[int], object] = lambda count: None) -> Predicted:
+    def predict(self, heights: Heights, on_progress: Progress = lambda count: None) -> Predicted:
         """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid; heights as `simulate` takes
         them.
 
@@ -102,20 +99,12 @@ class Predictor:
         one = (lambda array: array[0]) if alone else (lambda array: array)
         return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
 
-    def _outputs(self, maps: np.ndarray, on_progress: Callable[[int], object]) -> tuple[np.ndarray, np.ndarray | None]:
-        """Logits and margins of the trajectories of maps: [n, t, 3] each, no margins of an estimator without any."""
-        graph, variables = split_model(self.network)
-        devices = Devices.all()
-        variables, source = devices.replicate(variables), devices.replicate(self.run.source(maps))
-        every, trajectories = np.arange(len(maps)), len(self.run.actions)
-        if isinstance(source, MapSource):
-            told = lambda count: on_progress(count * trajectories)
-            logits, margins = np.split(hazards(graph, variables, source, every, devices, told), 2, axis=-1)
-            return logits, margins * np.asarray(self.run.robot.limits, np.float32)
-        samples: Samples = (np.repeat(every, trajectories), np.tile(np.arange(trajectories), len(maps)))
-        size = 64 * devices.mesh.size
-        logits = logits_of(graph, variables, source, samples, devices, size, on_progress)
-        return logits.reshape(len(maps), trajectories, -1), None
+    def _outputs(self, maps: np.ndarray, on_progress: Progress) -> tuple[np.ndarray, np.ndarray | None]:
+        """Returns logits and margins of the trajectories of maps: [n, t, 3] each, no margins where there are none."""
+        run, devices = self.run, Devices.all()
+        placed = Placed.from_network(self.network, devices.replicate(run.source(maps)), devices)
+        logits, margins = run.kind.of_maps(placed, np.arange(len(maps)), len(run.actions), on_progress)
+        return logits, None if margins is None else margins * np.asarray(run.robot.limits, np.float32)
 
 
 def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t 3"]:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,26 +11,20 @@ import jax
 import numpy as np
 from flax import nnx
 
-import travjax.models.hazard_field
-import travjax.models.trajectory_resnet
 from travjax.config import InputError, one_line, parts_from_json, read_json, require, shown, to_json
+from travjax.estimators.inference import Progress
+from travjax.estimators.kind import EstimatorKind
+from travjax.estimators.names import ESTIMATORS
+from travjax.estimators.preset import Preset
 from travjax.files import save_text, user_path
 from travjax.jax_flags import usual_flags
-from travjax.models.hazard_field import HazardField
-from travjax.models.input_images import ImageSource
-from travjax.models.names import FIELD
-from travjax.models.trajectory_resnet import VARIABLES, Estimator, merge_model, split_model
+from travjax.models.variables import VARIABLES, Network, merge_model, split_model
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.weight_files import require_finite
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.map_samples import MapSource
-from travjax.runs.preset import Preset
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-
-TRAINED = {1: ("heads",), 2: ("trunk", "heads"), FIELD: ("trunk", "heads")}
-"""What each phase trains, and training of the hazard field."""
 
 COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
 """What a checkpoint says of where training stood: whole numbers, and others."""
@@ -40,10 +33,6 @@ DATA = "data"
 """Folder of a run's own data set."""
 
 _PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
-
-
-Network = Estimator | HazardField
-"""An estimator of either model."""
 
 
 @dataclass(frozen=True)
@@ -88,25 +77,22 @@ class Run:
             if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
 
+    @property
+    def kind(self) -> EstimatorKind:
+        """The estimator's kind, which says how it is made, trained and read."""
+        return ESTIMATORS[self.preset.model].load()
+
     @usual_flags()
     def create(self, seed: int = 0, weights: Weights | None = None) -> Network:
-        """An estimator with random parameters, or a ResNet with a trunk of `weights`.
+        """Makes a network with random parameters, or with a trunk of `weights`.
 
-        Raises InputError for weights of another trunk, or where the hazard field is to begin with any.
+        Raises InputError for weights that are not for it.
         """
-        if self.preset.model == FIELD:
-            require(weights is None, "weights", self.preset.weights, '"none": the hazard field begins with random ones')
-            return travjax.models.hazard_field.create(self.preset.field, seed)
-        return travjax.models.trajectory_resnet.create(self.preset.trunk, self.preset.heads, seed, weights)
+        return self.kind.create(self.preset, seed, weights)
 
-    def source(
-        self, heights: np.ndarray, on_progress: Callable[[int], object] = lambda count: None
-    ) -> ImageSource | MapSource:
-        """Maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
-        scale = self.preset.elevation_scale
-        if self.preset.model == FIELD:
-            return MapSource.from_maps(heights, self.robot, self.actions, self.grid, scale)
-        return ImageSource.from_maps(heights, self.robot, self.actions, self.grid, scale, on_progress)
+    def source(self, heights: np.ndarray, on_progress: Progress = lambda count: None) -> Any:
+        """Returns maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
+        return self.kind.source(self.preset, heights, self.robot, self.actions, self.grid, on_progress)
 
     @usual_flags()
     def graph(self) -> nnx.GraphDef:
@@ -115,12 +101,17 @@ class Run:
 
     @usual_flags()
     def template(self, phase: int, sharding: jax.sharding.Sharding | None = None) -> dict[str, Any]:
-        """Shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer."""
+        """Returns the shapes of the state of a phase, for a checkpoint; phase 0 is without an optimizer.
+
+        Raises InputError for a phase that the estimator does not have.
+        """
+        phases = self.kind.phases
+        require(phase in (0, *phases), f"phase of {self.kind.title}", phase, f"one of {[0, *phases]}")
 
         def state():
             variables = split_model(self.create())[1]
             if phase:
-                trained = {name: variables[name] for name in TRAINED[phase]}
+                trained = {name: variables[name] for name in phases[phase].trained}
                 variables |= {"optimizer": self.preset.training.optimizer(phase, 1).init(trained)}
             return variables
 

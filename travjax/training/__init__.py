@@ -1,5 +1,5 @@
-"""Training of the estimators and their evaluation.
+"""Training of the estimators.
 
-In: a run and a data set. Out: checkpoints and logs in the run's folder; probabilities on test maps.
-Stands on Optax, runs/ and models/.
+In: a run and a data set. Out: checkpoints and logs in the run's folder.
+Stands on Optax, runs/ and estimators/.
 """

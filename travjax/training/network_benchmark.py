@@ -15,16 +15,19 @@ import numpy as np
 from travjax.data.dataset import DatasetConfig, generate
 from travjax.data.sampling import Sampler, batches
 from travjax.devices import Devices
+from travjax.estimators.inference import Placed, over_samples
+from travjax.estimators.kind import Batch
+from travjax.estimators.preset import TrainingConfig
+from travjax.estimators.trajectory_estimator import TrajectoryEstimator, sample_logits
 from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import VARIABLES, create, split_model
+from travjax.models.trajectory_resnet import create
+from travjax.models.variables import VARIABLES, split_model
 from travjax.resnet.network import ResNetConfig
-from travjax.runs.inference import over_samples, sample_logits
-from travjax.runs.preset import TrainingConfig
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import EVENTS, unpacked
-from travjax.training.step import update
+from travjax.training.step import StepSettings, update
 
 COLUMNS = {
     "what": "what",
@@ -81,28 +84,19 @@ class Bench:
 
     def training_step(self) -> dict:
         """Everything trained, from sample indices to new parameters."""
-        optimizer = TrainingConfig().optimizer(2, 1)
-        trained = {name: self.variables[name] for name in ("trunk", "heads")}
+        phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().optimizer(2, 1)
+        settings = StepSettings(self.graph, phase, optimizer, penalty=0.001)
+        trained = {name: self.variables[name] for name in phase.trained}
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}
         state = self.devices.replicate(state)
         maps, trajectories = (index[:STEP_BATCH] for index in self.sampler.epoch(0))
         failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories])[0], np.float32)
-        inputs = self.devices.shard((maps, trajectories, failed, np.ones(STEP_BATCH, np.float32)))
+        inputs = phase.place(self.source, (maps, trajectories), self.devices)
+        batch = Batch(inputs, *self.devices.shard((failed, np.ones(STEP_BATCH, np.float32))))
 
         def step():
             nonlocal state
-            state, loss = update(
-                state,
-                (self.source, *inputs[:2]),
-                inputs[2],
-                inputs[3],
-                0,
-                0,
-                graph=self.graph,
-                phase=2,
-                optimizer=optimizer,
-                penalty=0.001,
-            )
+            state, loss = update(state, batch, 0, 0, settings=settings)
             return loss
 
         return self._timed(FLAX, STEP_BATCH, step)
@@ -116,7 +110,8 @@ class Bench:
         count = len(self.dataset.actions)
         samples = (np.zeros(count, np.int32), np.arange(count, dtype=np.int32))
         variables = self.devices.replicate({name: self.variables[name] for name in VARIABLES})
-        run = lambda: over_samples(sample_logits, self.graph, variables, self.source, samples, self.devices, batch)
+        placed = Placed(self.graph, variables, self.source, self.devices)
+        run = lambda: over_samples(sample_logits, placed, samples, batch)
         return self._timed(f"all {count} trajectories of a map through the network", count, run, repeats)
 
     def _timed(self, what: str, batch: int, run: Callable[[], object], repeats: int | None = None) -> dict:

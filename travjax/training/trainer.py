@@ -1,14 +1,13 @@
 """Training in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
 
 All that is random follows from the training seed and the step, so a run that was interrupted goes on as if it had not
-been. What a step does is in step.py, on which samples in trajectory_samples.py.
+been. What a step does is in step.py; the estimator's kind (estimators/kind.py) says with which loss, on what.
 """
 
-import itertools
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -24,18 +23,16 @@ from travjax.config import InputError, one_line, require
 from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
+from travjax.estimators.inference import NoNumbers, Placed, probabilities
+from travjax.estimators.kind import Batch, Phase
 from travjax.evaluation import metrics
 from travjax.files import held
 from travjax.jax_flags import usual_flags
-from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import VARIABLES, split_model
+from travjax.models.variables import VARIABLES, Network, Variables, split_model
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.inference import NoNumbers, feature_logits, features_of, logits_of, probabilities
-from travjax.runs.map_samples import MapSource
-from travjax.runs.run import TRAINED, Network, Run, checked_meta
+from travjax.runs.run import Run, checked_meta
 from travjax.runs.run_log import RunLog
-from travjax.training.step import State, is_finite, update
-from travjax.training.trajectory_samples import TrainingData
+from travjax.training.step import State, StepSettings, is_finite, update
 
 IN_FLIGHT = 2
 """Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
@@ -67,6 +64,7 @@ class Trainer:
     data: what is trained on; state: that of step.py; position: where it stands
     watched: named samples on which each epoch is scored beside the validation, and the first state; training does not
         depend on them
+    features: of the frozen trunk, as `features` of another run of the same trunk and samples; else they are computed
     Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
     validation samples, or when the devices cannot share a batch.
     """
@@ -79,36 +77,42 @@ class Trainer:
         devices: Devices,
         quiet: bool = False,
         watched: Mapping[str, Samples] | None = None,
+        features: Mapping[str, np.ndarray] | None = None,
     ):
         require_matching(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
         self.run, self.folder, self.devices = run, folder, devices
-        self.config = run.preset.training
-        self.data = self._data(dataset)
+        self.kind, self.config = run.kind, run.preset.training
+        self.data = self.kind.data(run.preset, dataset)
         self.quiet = quiet or not devices.main
         self.scored = {"validation": self.data.validation} | dict(watched or {})
         self.checkpoints = Checkpoints(folder / "checkpoints")
         self.position = Position()
+        self._given_features = features
         self._optimizers: dict[int, optax.GradientTransformation] = {}
         self.graph = run.graph()
         self.log: RunLog | None = None
 
-    def _data(self, dataset: Dataset) -> TrainingData:
-        return TrainingData(dataset, self.config)
-
     @cached_property
-    def source(self) -> ImageSource | MapSource:
-        """Images of all samples, or all maps, on the devices."""
+    def source(self) -> Any:
+        """The maps as the estimator takes them, on the devices."""
         with self._bar("trajectory bank", len(self.run.actions), "trajectory") as bar:
             source = self.run.source(self.data.dataset.heights, bar.update)
         return self.devices.replicate(source)
 
+    @property
+    def phase(self) -> Phase:
+        """What the steps of the present phase do."""
+        return self.kind.phases[self.position.phase]
+
     @cached_property
-    def features(self) -> dict[str, np.ndarray]:
-        """The frozen trunk's features of the samples of phase 1, computed once; those of a run of the same trunk and
-        samples may be set instead."""
-        samples = {"training": self.data.samples(1, 0)} | self.scored
-        return {name: self._over(features_of, part, f"{name} features") for name, part in samples.items()}
+    def features(self) -> Mapping[str, np.ndarray]:
+        """The features of a frozen trunk by the names of the samples, computed once unless they were given."""
+        if self._given_features is not None:
+            return self._given_features
+        frozen, samples = self.phase.frozen_trunk, {"training": self.data.samples(1, 0)} | self.scored
+        assert frozen, "only asked for in a phase with a frozen trunk"
+        return {name: self._over(frozen.features, part, f"{name} features") for name, part in samples.items()}
 
     @usual_flags()
     def start(self, estimator: Network) -> None:
@@ -164,14 +168,16 @@ class Trainer:
 
     def _begin(self, phase: int) -> None:
         """A new optimizer, for what the phase trains."""
-        self.__dict__.pop("features", None)  # gigabytes for a large data set
         self.position.phase, self.position.epoch = phase, 0
-        trained = {name: self.state[name] for name in TRAINED[phase]}
+        self.__dict__.pop("features", None)  # gigabytes for a large data set
+        if not self.phase.frozen_trunk:
+            self._given_features = None
+        trained = {name: self.state[name] for name in self.phase.trained}
         optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
         self.state = self._variables | {"optimizer": optimizer}
 
     @property
-    def _variables(self) -> State:
+    def _variables(self) -> Variables:
         """The state without its optimizer."""
         return {name: self.state[name] for name in VARIABLES}
 
@@ -191,8 +197,8 @@ class Trainer:
         began = time.perf_counter()
         running: deque[tuple[jax.Array, float]] = deque()
         with self._bar(f"phase {here.phase}, epoch {here.epoch + 1}", count, initial=int(done)) as bar:
-            for inputs, failed, weight in self._batches():
-                running.append((self._step(inputs, failed, weight), float(weight.sum())))
+            for batch in self._batches():
+                running.append((self._step(batch), float(batch.weight.sum())))
                 here.step, here.total = here.step + 1, here.total + 1
                 saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
                 while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
@@ -206,36 +212,20 @@ class Trainer:
                     self.checkpoints.save(here.total, self.state, self._meta(here.phase))
         self._finish_epoch((here.samples - done) / (time.perf_counter() - began))
 
-    def _batches(self) -> Iterator[tuple[Any, Any, np.ndarray]]:
-        """What the steps of this epoch take, from the present one on."""
-        here, inputs_of = self.position, self._inputs()
-        for places, failed, weight in itertools.islice(self.data.batches(here.phase, here.epoch), here.step, None):
-            yield inputs_of(places), failed, weight
-
-    def _inputs(self) -> Callable[[np.ndarray], Any]:
-        """What a step of this epoch takes, from the places of its samples; features are computed if need be."""
+    def _batches(self) -> Iterator[Batch]:
+        """Yields the batches of this epoch from the present step on, features of a frozen trunk in place of samples."""
         here = self.position
-        if here.phase == 1:
-            features = self.features["training"]
-            return lambda places: features[places]
-        maps, trajectories = self.data.samples(here.phase, here.epoch)
-        return lambda places: (maps[places], trajectories[places])
+        for batch in self.data.batches(here.phase, here.epoch, here.step):
+            yield batch._replace(inputs=self.features["training"][batch.inputs]) if self.phase.frozen_trunk else batch
 
-    def _step(self, inputs, failed, weight) -> jax.Array:
-        phase = self.position.phase
-        inputs, failed, weight = self.devices.shard((inputs, failed, weight))
-        self.state, loss = update(
-            self.state,
-            inputs if phase == 1 else (self.source, *inputs),
-            failed,
-            weight,
-            self.config.seed,
-            self.position.total,
-            graph=self.graph,
-            phase=phase,
-            optimizer=self._optimizer(phase),
-            penalty=self.config.penalty,
-        )
+    def _step(self, batch: Batch) -> jax.Array:
+        """Takes a step and returns its loss, which the devices may still be at work on."""
+        phase, devices = self.phase, self.devices
+        frozen = phase.frozen_trunk
+        inputs = devices.shard(batch.inputs) if frozen else phase.place(self.source, batch.inputs, devices)
+        placed = Batch(inputs, *devices.shard((batch.targets, batch.weight)))
+        settings = StepSettings(self.graph, phase, self._optimizer(self.position.phase), self.config.penalty)
+        self.state, loss = update(self.state, placed, self.config.seed, self.position.total, settings=settings)
         return loss
 
     def _count(self, loss: jax.Array, samples: float, number: int, bar: progress.Bar) -> None:
@@ -285,15 +275,15 @@ class Trainer:
         return {"watched": metrics.json_ready(scores)} if names else {}
 
     def _logits(self, name: str) -> np.ndarray:
-        """Of the samples of that name, by the present state: [k, 3]."""
-        if self.position.phase == 1:
+        """Returns the logits of the samples of that name, by the present state: [k, 3]."""
+        if frozen := self.phase.frozen_trunk:
             features = self.devices.replicate(self.features[name])
-            logits = self.devices.fetch(feature_logits(self.graph, self._variables, features))
+            logits = self.devices.fetch(frozen.logits(self.graph, self._variables, features))
             if np.isfinite(logits).all():
                 return logits
         else:
             with suppress(NoNumbers):
-                return self._over(logits_of, self.scored[name], name)
+                return self._over(self.kind.logits, self.scored[name], name)
         raise self._diverged(f"a {name} logit that is no number", self.position.step)
 
     def summary(self) -> str:
@@ -305,10 +295,9 @@ class Trainer:
         )
 
     def _over(self, function, samples: Samples, what: str) -> np.ndarray:
-        variables = self._variables
+        placed = Placed(self.graph, self._variables, self.source, self.devices)
         with self._bar(what, len(samples[0])) as bar:
-            size = self.config.batch_size
-            return function(self.graph, variables, self.source, samples, self.devices, size, bar.update)
+            return function(placed, samples, self.config.batch_size, bar.update)
 
     def _meta(self, optimizer: int) -> dict[str, Any]:
         """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""

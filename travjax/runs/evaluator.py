@@ -1,9 +1,9 @@
 """Evaluation of a trained estimator on the test maps of a data set (SPEC section 10)."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any
 
 import numpy as np
 
@@ -12,18 +12,12 @@ from travjax.data import map_batches
 from travjax.data.dataset import Dataset, require_matching
 from travjax.data.sampling import Samples, balanced_subset, every_sample, natural_sample
 from travjax.devices import Devices
+from travjax.estimators.inference import Placed, Progress, probabilities
 from travjax.evaluation import metrics
 from travjax.evaluation.baselines import LogisticRegression, slope_and_step
-from travjax.models.hazard_field import HazardField
-from travjax.models.input_images import ImageSource
-from travjax.models.trajectory_resnet import split_model
-from travjax.runs.inference import hazards, logits_of, probabilities
-from travjax.runs.map_samples import MapSource
-from travjax.runs.run import Network, Run
+from travjax.models.variables import Network
+from travjax.runs.run import Run
 from travjax.simulation.traverse import as_in_paper, simulate, unpacked
-from travjax.training.step import LARGE_MARGIN
-
-Progress = Callable[[int], object]
 
 SPARSEST = 6
 """A figure shows every sixth trajectory at least."""
@@ -42,7 +36,7 @@ class Evaluator:
 
     run: Run
     dataset: Dataset
-    source: ImageSource | MapSource
+    source: Any
     devices: Devices
 
     @staticmethod
@@ -75,29 +69,29 @@ class Evaluator:
         self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
         """Of samples: [k, 3]."""
-        graph, variables = split_model(estimator)
-        variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
-        logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
-        return probabilities(logits)
+        placed = Placed.from_network(estimator, self.source, self.devices)
+        size = self.run.preset.training.batch_size
+        return probabilities(self.run.kind.logits(placed, samples, size, on_progress))
 
     def margins(
-        self, network: HazardField, samples: Samples, on_progress: Progress = lambda count: None
+        self, network: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
+        """Returns predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
 
-        Both are cut off where training does not tell them apart any more. on_progress: is told of maps
+        For estimators that have margins. Both are cut off at the kind's largest margin. on_progress: is told of maps
         Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
         """
-        graph, variables = split_model(network)
         maps, place = np.unique(samples[0], return_inverse=True)
-        source = cast(MapSource, self.source)
-        found = hazards(graph, self.devices.replicate(variables), source, maps, self.devices, on_progress)
-        run = self.run
+        run, count = self.run, len(self.run.actions)
+        placed = Placed.from_network(network, self.source, self.devices)
+        margins = run.kind.of_maps(placed, maps, count, lambda done: on_progress(done // count))[1]
+        largest = run.kind.largest_margin
+        assert margins is not None and largest is not None
         simulated = simulate(self.dataset.heights[maps], run.robot, run.actions, grid=run.grid).events()
         true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
         allowed = "known trajectories alone, as its labels say"
         require(bool(np.isfinite(true).all()), "data set, margins", "NaN", allowed)
-        return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], 3:], true))  # type: ignore
+        return np.minimum(margins[place, samples[1]], largest), np.minimum(true, largest)
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
         """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""
@@ -118,10 +112,10 @@ class Evaluator:
     def every(self, maps: int, samples: int) -> int:
         """Every how many trajectories of so many maps to show, so that a figure takes no longer than `samples` do.
 
-        At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. The hazard field reads
-        all trajectories of a map at once: all are shown.
+        At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. Where whole maps are
+        read at once, all are shown.
         """
-        if isinstance(self.source, MapSource):
+        if self.run.kind.reads_whole_maps:
             return 1
         most = min(SPARSEST, -(-maps * len(self.run.actions) // samples))
         return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)

@@ -1,5 +1,6 @@
 """The samples of each epoch of a training run, and their batches; all NumPy on the host."""
 
+import itertools
 from collections.abc import Iterator
 from functools import cached_property
 
@@ -8,11 +9,12 @@ import numpy as np
 from travjax.config import require
 from travjax.data.dataset import Dataset
 from travjax.data.sampling import Sampler, Samples, balanced_subset, batches, random_keys
-from travjax.runs.preset import TrainingConfig
+from travjax.estimators.kind import Batch
+from travjax.estimators.preset import TrainingConfig
 from travjax.simulation.traverse import unpacked
 
 
-class TrainingData:
+class TrajectorySamples:
     """Samples of a data set's training and validation maps.
 
     Raises InputError when there are none of either.
@@ -56,17 +58,20 @@ class TrainingData:
         """Batches of an epoch."""
         return -(-self.count(phase, epoch) // self.config.batch_size)
 
-    def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Places in `samples` [b], failures [b, 3] and weights [b] of each step, in an order of the epoch's own.
+    def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
+        """Yields the batches of an epoch from the first-th on, in an order of the epoch's own.
 
+        inputs:  maps [b] and trajectories [b]; in phase 1 places in `samples` [b]
+        targets: failures [b, 3]
         The samples that fill up the last batch have weight 0, but count in its batch statistics.
         """
         samples = self.samples(phase, epoch)
         failed, places = self.failed(samples), np.arange(len(samples[0]))
         stream = 2 * epoch + phase - 1
         chosen, _, weights = batches((places, places), self.config.batch_size, self.config.seed, stream)
-        for index, weight in zip(chosen, weights, strict=True):
-            yield index, failed[index], weight
+        for index, weight in itertools.islice(zip(chosen, weights, strict=True), first, None):
+            inputs = index if phase == 1 else (samples[0][index], samples[1][index])
+            yield Batch(inputs, failed[index], weight)
 
     def summary(self) -> str:
         """What is trained on, for people."""

@@ -5,7 +5,10 @@ Each step sees a few maps, after some quarter turns in one of the views in which
 on the clean map, so they are exact in every view. All that is random follows from the training seed and the step.
 """
 
+import itertools
+from collections import deque
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -18,9 +21,10 @@ from travjax.config import require
 from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples, batches, every_sample
 from travjax.data.sensor_noise import corrupted, filled
+from travjax.estimators.kind import Batch
+from travjax.estimators.preset import Preset
 from travjax.jax_flags import usual_flags
 from travjax.models.pose_stencil import Stencil, stencil
-from travjax.runs.preset import Preset
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import views_of
 from travjax.simulation.grid import Grid
@@ -58,7 +62,7 @@ def relative(heights, scale):
     return (heights - heights[:, middle, middle, None, None]) / scale
 
 
-class MapData:
+class MapSamples:
     """The training and validation maps of a data set.
 
     Raises InputError when there are none of either.
@@ -77,6 +81,10 @@ class MapData:
         count = max(self.config.validation_samples // len(self.dataset.actions), 1)
         return every_sample(self.dataset.labels, maps[:: max(len(maps) // count, 1)][:count])
 
+    def samples(self, phase: int, epoch: int) -> Samples:
+        """Returns all known trajectories of the training maps; a step sees some of them."""
+        return every_sample(self.dataset.labels, self.maps)
+
     def failed(self, samples: Samples) -> np.ndarray:
         """Failures of samples: [k, 3] float32."""
         return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
@@ -89,15 +97,26 @@ class MapData:
         """Batches of an epoch."""
         return -(-len(self.maps) // self.config.batch_size)
 
-    def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, None, np.ndarray]]:
-        """Maps [b] and weights [b] of each step, as `TrainingData.batches`."""
-        chosen, _, weights = batches((self.maps, self.maps), self.config.batch_size, self.config.seed, epoch)
-        for maps, weight in zip(chosen, weights, strict=True):
-            yield maps, None, weight
+    def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
+        """Yields the batches of an epoch from the first-th on; the next one is prepared while a step runs."""
+        ahead = deque[tuple[Future, np.ndarray]]()
+        numbered = zip(itertools.count(epoch * self.steps(phase)), *self.chosen(epoch), strict=False)
+        with ThreadPoolExecutor(1) as pool:
+            for step, maps, weight in itertools.islice(numbered, first, None):
+                ahead.append((pool.submit(self.prepared, maps, step), weight))
+                if len(ahead) == 2:
+                    yield _batch(*ahead.popleft())
+            for prepared, weight in ahead:
+                yield _batch(prepared, weight)
+
+    def chosen(self, epoch: int) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the maps and the weights of each step of an epoch: [s, b] each."""
+        maps, _, weights = batches((self.maps, self.maps), self.config.batch_size, self.config.seed, epoch)
+        return maps, weights
 
     @usual_flags()  # in a thread of its own
     def prepared(self, maps: np.ndarray, step: int):
-        """Inputs and targets of a step on maps [b], as training/step.py takes them."""
+        """Prepares inputs and targets of a step, counted from the first of all, on maps [b]."""
         data, preset, rng = self.dataset, self.preset, np.random.default_rng((self.config.seed, step))
         views = views_of(data.actions)
         view = views[rng.integers(len(views))]
@@ -120,6 +139,12 @@ class MapData:
     def summary(self) -> str:
         """What is trained on, for people."""
         return f"{len(self.maps)} training maps; {len(self.validation[0])} validation samples"
+
+
+def _batch(prepared: Future, weight: np.ndarray) -> Batch:
+    """Waits for what a step is trained on."""
+    inputs, targets = prepared.result()
+    return Batch(inputs, targets, weight)
 
 
 @partial(jax.jit, static_argnames="limits")

@@ -11,8 +11,8 @@ from tests.field_runs import PRESET
 from tests.small_training import GRID, HUSKY, dataset
 from travjax.config import InputError
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.estimators.map_samples import MapSamples, MapSource
 from travjax.models.pose_stencil import stencil
-from travjax.runs.map_samples import MapData, MapSource
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import View, views_of
 from travjax.simulation.grid import Grid
@@ -22,8 +22,8 @@ CLEAN = replace(PRESET, corruption=CorruptionConfig(0.0))
 STEPS = range(12)
 
 
-def data_of(preset=CLEAN, data=None, **training) -> MapData:
-    return MapData(data or dataset(), replace(preset, training=replace(preset.training, **training)))
+def data_of(preset=CLEAN, data=None, **training) -> MapSamples:
+    return MapSamples(data or dataset(), replace(preset, training=replace(preset.training, **training)))
 
 
 def shown(prepared) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -172,11 +172,30 @@ def test_trajectories_on_unknown_ground_are_no_targets():
 # ---- Which maps
 
 
+def test_batches_are_the_prepared_steps_of_an_epoch_from_any_of_them_on():
+    data = data_of(PRESET)
+    batches, (maps, weights) = list(data.batches(2, 1)), data.chosen(1)
+    assert len(batches) == data.steps(2) == 5
+    for number, batch in enumerate(batches):
+        np.testing.assert_array_equal(batch.weight, weights[number])
+        for one, other in zip(shown(batch[:2]), shown(data.prepared(maps[number], 5 + number)), strict=True):
+            np.testing.assert_array_equal(one, other)
+    later = list(data.batches(2, 1, 3))
+    assert len(later) == 2
+    np.testing.assert_array_equal(shown(later[0][:2])[0], shown(batches[3][:2])[0])
+
+
+def test_the_samples_of_an_epoch_are_all_known_trajectories_of_the_training_maps():
+    data = data_of()
+    known = np.asarray(unpacked(dataset().labels[data.maps])[1])
+    assert len(data.samples(2, 0)[0]) == known.sum() and set(data.samples(2, 0)[0]) <= set(data.maps)
+
+
 def test_an_epoch_is_every_training_map_once_in_random_order():
     data, orders = data_of(), []
     for epoch in (0, 1, 0):
-        maps, places, weights = zip(*data.batches(2, epoch), strict=True)
-        assert data.steps(2) == len(maps) == 5 and set(places) == {None} and np.shape(maps) == (5, 4)
+        maps, weights = data.chosen(epoch)
+        assert data.steps(2) == len(maps) == 5 and np.shape(maps) == (5, 4)
         order, weight = np.concatenate(maps), np.concatenate(weights)
         assert weight.sum() == data.count(2, epoch) == 18 and set(weight) == {0, 1}
         np.testing.assert_array_equal(np.sort(order[weight > 0]), dataset().maps_of("train"))

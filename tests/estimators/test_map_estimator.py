@@ -8,16 +8,14 @@ import pytest
 
 from tests.commandline import FEW
 from tests.field_runs import CONFIG, PRESET, RUN, begun, trainer
-from tests.small_training import copy, dataset, require_equal, rows_of, run_of, saved_state
+from tests.small_training import copy, dataset, require_equal, rows_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
-from travjax.models.trajectory_resnet import split_model
-from travjax.runs.inference import hazards
+from travjax.estimators.inference import Placed
+from travjax.estimators.map_estimator import hazards
+from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import load_estimator
 from travjax.simulation.traverse import EVENTS
-from travjax.training.evaluator import Evaluator
-from travjax.training.map_training import FieldTrainer, trainer_of
-from travjax.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -72,6 +70,17 @@ def test_margins_count_by_their_weight(tmp_path):
     assert losses[2] - losses[0] == pytest.approx(3 * (losses[1] - losses[0]), rel=1e-3)
 
 
+def test_the_kernels_of_the_heads_decay_under_rmsprop(tmp_path):
+    """With a learning rate of each number's own, a strong decay alone drives them towards zero."""
+    size = {}
+    for decay in (0.0, 10.0):
+        made = begun(tmp_path / f"{decay}", method="rmsprop", weight_decay=decay, epochs=1)
+        made.train()
+        heads = saved_state(tmp_path / f"{decay}")
+        size[decay] = sum((heads[f"heads/heads/{layer}/kernel"] ** 2).sum() for layer in ("first", "second", "hazard"))
+    assert size[10.0] < size[0.0]
+
+
 def test_a_trained_field_predicts_margins(whole):
     run, network, meta = load_estimator(whole)
     evaluator = Evaluator.from_run(run, dataset(), Devices.all())
@@ -80,7 +89,8 @@ def test_a_trained_field_predicts_margins(whole):
     assert predicted.shape == true.shape == (len(samples[0]), len(EVENTS)) and true.max() <= 4
     failed = evaluator.failed(samples)
     np.testing.assert_array_equal(true > 1, failed)
-    whole_maps = hazards(*split_model(network), evaluator.source, np.unique(samples[0]), evaluator.devices)
+    placed = Placed.from_network(network, evaluator.source, evaluator.devices)
+    whole_maps = hazards(placed, np.unique(samples[0]))
     np.testing.assert_allclose(predicted, np.minimum(whole_maps[..., 3:].reshape(predicted.shape), 4), atol=1e-5)
     assert meta["position"]["phase"] == 2 and network.trunk.config == CONFIG
 
@@ -99,10 +109,6 @@ def test_a_damaged_latest_checkpoint_is_passed_over(whole, tmp_path):
     latest = sorted(path for path in (spoilt / "checkpoints").iterdir() if "step-40" in path.name)[0]
     (latest / "meta.json").write_text("{")
     assert load_estimator(spoilt, "latest")[2]["position"]["total"] < 40
-
-
-def test_the_model_of_a_run_chooses_its_trainer():
-    assert trainer_of(RUN) is FieldTrainer and trainer_of(run_of()) is Trainer
 
 
 def test_the_hazard_field_begins_with_random_weights():

@@ -15,11 +15,11 @@ from travjax.devices import Devices
 from travjax.evaluation.baselines import slope_and_step
 from travjax.evaluation.metrics import PAPER_SYNTHETIC, average_precision
 from travjax.models.input_images import render_inputs
-from travjax.models.trajectory_resnet import split_model
+from travjax.models.variables import split_model
+from travjax.runs.evaluator import Evaluator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import unpacked
-from travjax.training.evaluator import Evaluator
 
 
 @pytest.fixture(scope="module")
@@ -159,8 +159,8 @@ def test_the_baseline_takes_no_more_training_samples_than_it_should(evaluator, m
         taken.append(len(np.unique(samples[0])))
         return slope_and_step(heights, samples, *rest)
 
-    monkeypatch.setattr("travjax.training.evaluator.slope_and_step", counted)
-    monkeypatch.setattr("travjax.training.evaluator.REGRESSION_SAMPLES", 15)
+    monkeypatch.setattr("travjax.runs.evaluator.slope_and_step", counted)
+    monkeypatch.setattr("travjax.runs.evaluator.REGRESSION_SAMPLES", 15)
     evaluator.regression(evaluator.samples(0, 0))
     assert taken[0] == 15 // PRESET.training.each
 

@@ -8,9 +8,9 @@ import optax
 from travjax.config import InputError, load_toml, require, require_length, require_number
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.estimators.names import ESTIMATORS, RESNET
 from travjax.files import find_data
 from travjax.models.hazard_field import FieldConfig
-from travjax.models.names import FIELD, MODELS, RESNET
 from travjax.models.trajectory_resnet import HeadsConfig
 from travjax.resnet.fetched_weights import fetched_weights
 from travjax.resnet.network import ResNetConfig
@@ -142,7 +142,7 @@ class EvaluationConfig:
 class Preset:
     """A training run.
 
-    model:           the estimator, one of MODELS
+    model:           the estimator, one of ESTIMATORS
     robot:           a preset or a .toml file
     weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones; where there
                      is no file of the name IMAGENET_WEIGHTS, others are fetched
@@ -167,10 +167,10 @@ class Preset:
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def __post_init__(self):
-        require(self.model in MODELS, "model", self.model, f"one of {', '.join(MODELS)}")
-        if self.model == FIELD:
-            epochs = self.training.head_epochs
-            require(epochs == 0, "[training] head_epochs", epochs, "0: the hazard field has no frozen trunk")
+        require(self.model in ESTIMATORS, "model", self.model, f"one of {', '.join(ESTIMATORS)}")
+        if epochs := self.training.head_epochs:
+            kind = ESTIMATORS[self.model].load()
+            require(1 in kind.phases, "[training] head_epochs", epochs, f"0: {kind.title} has no frozen trunk")
         for name in ("robot", "weights"):
             value = getattr(self, name)
             require(isinstance(value, str) and bool(value), name, value, "a non-empty text")

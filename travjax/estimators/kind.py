@@ -1,0 +1,159 @@
+"""What training, evaluation and prediction ask of an estimator; each estimator has a class that answers.
+
+A class names the phases of its training, makes the network, its source (what is put on the devices once) and its
+training data, and reads logits out of it. Networks are split into `trunk` and `heads` (models/variables.py).
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Float, Key
+
+from travjax.data.dataset import Dataset
+from travjax.data.sampling import Samples
+from travjax.devices import Devices, PyTree
+from travjax.estimators.inference import Placed, Progress
+from travjax.estimators.preset import Preset
+from travjax.models.variables import Network, Variables
+from travjax.resnet.imagenet_weights import Weights
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+
+AT_ONCE = 64
+"""Samples that each device reads at once where whole maps are asked for."""
+
+
+class Batch(NamedTuple):
+    """What a step is trained on.
+
+    inputs, targets: what the phase's loss takes; weight: [b], 0 for a sample that only fills the batch up
+    """
+
+    inputs: PyTree
+    targets: PyTree
+    weight: Float[np.ndarray, " b"] | Float[Array, " b"]
+
+
+class TrainingData(Protocol):
+    """What a run is trained and validated on, on the host."""
+
+    dataset: Dataset
+
+    @property
+    def validation(self) -> Samples:
+        """The samples that each epoch is scored on."""
+
+    def samples(self, phase: int, epoch: int) -> Samples:
+        """Returns the training samples of an epoch."""
+
+    def failed(self, samples: Samples) -> Float[np.ndarray, "k 3"]:
+        """Returns the failures of samples."""
+
+    def count(self, phase: int, epoch: int) -> int:
+        """Counts what an epoch goes over: the sum of its batches' weights."""
+
+    def steps(self, phase: int, epoch: int = 0) -> int:
+        """Counts the batches of an epoch."""
+
+    def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
+        """Yields the batches of an epoch from the first-th on."""
+
+    def summary(self) -> str:
+        """Says in a few words what is trained on."""
+
+
+@dataclass(frozen=True)
+class FrozenTrunk:
+    """How a phase uses a trunk that stays as it is: its features of all samples are computed once.
+
+    features: of k samples, [k, f]; takes what `EstimatorKind.logits` does
+    logits:   of features, (graph, variables, features [b, f]) -> [b, 3]
+    """
+
+    features: Callable[[Placed, Samples, int, Progress], Float[np.ndarray, "k f"]]
+    logits: Callable[[nnx.GraphDef, Variables, Float[Array, "b f"]], Float[Array, "b 3"]]
+
+
+def beside_source(source: PyTree, inputs: tuple, devices: Devices) -> tuple:
+    """Puts the inputs of a step [b, ...] on the devices, a part on each, beside the estimator's source."""
+    return (source, *devices.shard(inputs))
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What the steps of a phase do; hashable, as compiled code depends on it.
+
+    trained:      parts of the network whose parameters move, of "trunk" and "heads"
+    loss:         of each sample of a batch, (network, inputs, targets, key) -> [b]; the key is for dropout
+    place:        puts inputs on the devices, (source, inputs, devices) -> inputs as `loss` takes them
+    frozen_trunk: if there is one, the inputs of a batch are places [b] in the phase's samples, and `loss` takes the
+                  features of these samples [b, f]
+    """
+
+    trained: tuple[str, ...]
+    loss: Callable[[Any, PyTree, PyTree, Key[Array, ""]], Float[Array, " b"]]
+    place: Callable[[PyTree, Any, Devices], PyTree] = beside_source
+    frozen_trunk: FrozenTrunk | None = None
+
+
+class EstimatorKind(Protocol):
+    """An estimator: to be subclassed, with an entry in names.py.
+
+    phases:           by number: 1 comes first, for the preset's head_epochs, and may be missing; 2 is for its epochs
+    title:            what a message calls it
+    largest_margin:   in units of the robot's limits: margins are not told apart above it; None where there are none
+    reads_whole_maps: whether all trajectories of a map take no longer than one
+    sees_images:      whether it is trained on images of map and trajectory, of which a run draws a few (inputs.png)
+    """
+
+    phases: Mapping[int, Phase]
+    title: str = "the estimator"
+    largest_margin: float | None = None
+    reads_whole_maps: bool = False
+    sees_images: bool = False
+
+    def create(self, preset: Preset, seed: int = 0, weights: Weights | None = None) -> Network:
+        """Makes the network with random parameters, or with a trunk of `weights`.
+
+        Raises InputError for weights that are not for it.
+        """
+
+    def source(
+        self,
+        preset: Preset,
+        heights: Float[np.ndarray, "n rows cols"],
+        robot: Robot,
+        actions: ActionSpace,
+        grid: Grid,
+        on_progress: Progress = lambda count: None,
+    ) -> PyTree:
+        """Returns what is put on the devices of maps, NaN unknown; on_progress: is told of trajectories."""
+
+    def data(self, preset: Preset, dataset: Dataset) -> TrainingData:
+        """Returns what of a data set is trained on.
+
+        Raises InputError when there are no training or no validation samples.
+        """
+
+    def logits(
+        self, placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
+    ) -> Float[np.ndarray, "k 3"]:
+        """Returns the logits of k samples, so many at once; on_progress: is told of samples.
+
+        Raises NoNumbers when one of them is NaN or infinite.
+        """
+
+    def of_maps(
+        self, placed: Placed, maps: np.ndarray, trajectories: int, on_progress: Progress = lambda count: None
+    ) -> tuple[Float[np.ndarray, "m t 3"], Float[np.ndarray, "m t 3"] | None]:
+        """Returns logits and, if it puts them out, margins in units of the robot's limits of all trajectories of maps.
+
+        on_progress: is told of samples. Raises as `logits` does.
+        """
+        samples = (np.repeat(maps, trajectories), np.tile(np.arange(trajectories), len(maps)))
+        size = AT_ONCE * placed.devices.mesh.size
+        return self.logits(placed, samples, size, on_progress).reshape(len(maps), trajectories, -1), None

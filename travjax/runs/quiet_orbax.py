@@ -1,0 +1,61 @@
+"""Orbax without what it prints, on event loops that wait for their own tasks and threads."""
+
+import asyncio
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import uvloop
+
+
+def _not_from_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in Path(record.pathname).parts
+
+
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that ends no earlier than its tasks and threads.
+
+    Orbax closes its own at the first error, while others of its reads and writes are under way: they would go on, each
+    would print a traceback, and what is removed would be made again.
+    """
+
+    def close(self) -> None:
+        if not self.is_closed():
+            self.run_until_complete(self._finish())
+        super().close()
+
+    async def _finish(self) -> None:
+        others = asyncio.all_tasks() - {asyncio.current_task()}
+        await asyncio.gather(*others, return_exceptions=True)
+        await self.shutdown_default_executor()
+
+
+class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+    _loop_factory = _PatientLoop
+
+
+@contextmanager
+def patient_loops() -> Iterator[None]:
+    """Has asyncio make patient loops, and uvloop, whose loops Orbax runs beside, as well."""
+    policy, new_event_loop = asyncio.get_event_loop_policy(), uvloop.new_event_loop
+    asyncio.set_event_loop_policy(_PatientPolicy())
+    uvloop.new_event_loop = lambda: _PatientLoop()  # type: ignore
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(policy)
+        uvloop.new_event_loop = new_event_loop
+
+
+@contextmanager
+def quiet_orbax() -> Iterator[Any]:
+    """Gives Orbax with patient loops, without its warnings and its log; its threads also log each error it raises."""
+    logging.getLogger("absl").addFilter(_not_from_orbax)  # adding it again changes nothing
+    with warnings.catch_warnings(), patient_loops():
+        warnings.simplefilter("ignore")
+        from orbax.checkpoint import v1 as ocp
+
+        yield ocp
