@@ -14,7 +14,7 @@ from travjax.devices import Devices
 from travjax.models.trajectory_resnet import split_model
 from travjax.runs.inference import hazards
 from travjax.runs.run import load_estimator
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 from travjax.training.evaluator import Evaluator
 from travjax.training.map_training import FieldTrainer, trainer_of
 from travjax.training.trainer import Trainer

@@ -42,7 +42,8 @@ from travjax.runs.checkpoint import load_meta
 from travjax.runs.inference import probabilities
 from travjax.runs.run import TRAINED, load_estimator
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.traverse import EVENTS, unpacked
+from travjax.simulation.events import EVENTS
+from travjax.simulation.traverse import unpacked
 from travjax.training.step import update
 from travjax.training.trainer import Trainer
 

@@ -32,7 +32,7 @@ class NoNumbers(InputError):
 
 @partial(jax.jit, static_argnames="graph")
 def sample_logits(graph, variables: Variables, source: ImageSource, map_index, trajectory_index):
-    """Logits of samples [b]: [b, 3]."""
+    """Logits of samples [b]: [b, events]."""
     return merge_model(graph, variables)(source.images(map_index, trajectory_index))
 
 
@@ -44,7 +44,7 @@ def sample_features(graph, variables: Variables, source: ImageSource, map_index,
 
 @partial(jax.jit, static_argnames="graph")
 def feature_logits(graph, variables: Variables, features: Float[Array, "b f"]):
-    """Logits of features of the trunk: [b, 3]."""
+    """Logits of features of the trunk: [b, events]."""
     return merge_model(graph, variables).heads(features)
 
 
@@ -92,7 +92,7 @@ def over_samples(
 
 @partial(jax.jit, static_argnames="graph")
 def map_hazards(graph, variables: Variables, source: MapSource, map_index):
-    """Logits, then margins in units of the limits, of all trajectories of maps [b]: [b, t, 6]."""
+    """Logits, then margins in units of the limits, of all trajectories of maps [b]: [b, t, 2 events]."""
     return jnp.concatenate(merge_model(graph, variables)(source.elevation(map_index), source.stencil), axis=-1)
 
 
@@ -104,7 +104,7 @@ def logits_of(
     devices: Devices,
     batch_size: int = 64,
     on_progress: Callable[[int], object] = lambda count: None,
-) -> Float[np.ndarray, "k 3"]:
+) -> Float[np.ndarray, "k events"]:
     """Logits of k samples: one by one, or from the hazard field of each of their maps.
 
     batch_size: samples at once; on_progress: is told how many samples were added
@@ -114,7 +114,7 @@ def logits_of(
     maps, place = np.unique(samples[0], return_inverse=True)
     each = len(place) // len(maps)
     added = hazards(graph, variables, source, maps, devices, lambda count: on_progress(count * each))
-    return added[place, samples[1], :3]
+    return added[place, samples[1], : added.shape[-1] // 2]
 
 
 def features_of(
@@ -137,7 +137,7 @@ def hazards(
     maps: np.ndarray,
     devices: Devices,
     on_progress: Callable[[int], object] = lambda count: None,
-) -> Float[np.ndarray, "m t 6"]:
+) -> Float[np.ndarray, "m t hazards"]:
     """`map_hazards` of maps [m], on the host."""
     count = devices.mesh.size
     size = min(MAPS, -(-len(maps) // count)) * count  # a single map is not read four times

@@ -96,8 +96,9 @@ class Run:
         """
         if self.preset.model == FIELD:
             require(weights is None, "weights", self.preset.weights, '"none": the hazard field begins with random ones')
-            return travjax.models.hazard_field.create(self.preset.field, seed)
-        return travjax.models.trajectory_resnet.create(self.preset.trunk, self.preset.heads, seed, weights)
+            return travjax.models.hazard_field.create(self.preset.field, seed, len(self.robot.events))
+        events = self.robot.event_names
+        return travjax.models.trajectory_resnet.create(self.preset.trunk, self.preset.heads, seed, weights, events)
 
     def source(
         self, heights: np.ndarray, on_progress: Callable[[int], object] = lambda count: None

@@ -68,13 +68,13 @@ class Evaluator:
         return samples
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, 3] bool."""
-        return np.asarray(unpacked(self.dataset.labels[samples])[0])
+        """Failures of samples: [k, events] bool."""
+        return np.asarray(unpacked(self.dataset.labels[samples], self.run.robot)[0])
 
     def probabilities(
         self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
-        """Of samples: [k, 3]."""
+        """Of samples: [k, events]."""
         graph, variables = split_model(estimator)
         variables, size = self.devices.replicate(variables), self.run.preset.training.batch_size
         logits = logits_of(graph, variables, self.source, samples, self.devices, size, on_progress)
@@ -83,7 +83,7 @@ class Evaluator:
     def margins(
         self, network: HazardField, samples: Samples, on_progress: Progress = lambda count: None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
+        """Predicted and true margins of samples, [k, events] each, in units of the robot's limits.
 
         Both are cut off where training does not tell them apart any more. on_progress: is told of maps
         Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
@@ -97,14 +97,14 @@ class Evaluator:
         true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
         allowed = "known trajectories alone, as its labels say"
         require(bool(np.isfinite(true).all()), "data set, margins", "NaN", allowed)
-        return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], 3:], true))  # type: ignore
+        return tuple(np.minimum(part, LARGE_MARGIN) for part in (found[place, samples[1], true.shape[1] :], true))  # type: ignore
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
         """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""
         data = self.dataset
         test = data.maps_of("test")
         test = test if group is None else test[data.group[test] == group]
-        failed, known = map(np.asarray, unpacked(data.labels[test]))
+        failed, known = map(np.asarray, unpacked(data.labels[test], self.run.robot))
         return test[map_batches.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
 
     def whole_maps(
@@ -127,7 +127,7 @@ class Evaluator:
         return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)
 
     def regression(self, samples: Samples) -> np.ndarray:
-        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""
+        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, events]."""
         config, run, heights = self.run.preset.training, self.run, self.dataset.heights
         maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.each)]
         known = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
@@ -141,6 +141,13 @@ class Evaluator:
         return metrics.PAPER_SYNTHETIC if compares else None
 
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
-        """All figures of predicted probabilities [k, 3], by style or site as well."""
+        """All figures of predicted probabilities [k, events], by style or site as well."""
         groups = self.dataset.group[samples[0]]
-        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls, paper=self.paper)
+        return metrics.evaluate(
+            probability,
+            self.failed(samples),
+            groups,
+            events=self.run.robot.event_names,
+            recalls=recalls,
+            paper=self.paper,
+        )

@@ -21,9 +21,10 @@ from travjax.resnet.network import ResNetConfig
 from travjax.runs.inference import over_samples, sample_logits
 from travjax.runs.preset import TrainingConfig
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS, unpacked
+from travjax.simulation.traverse import unpacked
 from travjax.training.step import update
 
 COLUMNS = {
@@ -53,7 +54,7 @@ class Bench:
         self.repeats, self.devices = repeats, Devices.all()
         self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
         self.source = self.devices.replicate(ImageSource.from_maps(self.dataset.heights, robot, actions, grid, 1.0))
-        self.graph, self.variables = split_model(create(trunk))
+        self.graph, self.variables = split_model(create(trunk, events=robot.event_names))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
@@ -75,7 +76,9 @@ class Bench:
         def batch():
             chosen = batches(self.sampler.epoch(next(epochs)), BATCH, 0, 0)
             samples = self.devices.shard((chosen[0][0], chosen[1][0]))
-            return self.source.images(*samples), unpacked(self.dataset.labels[chosen[0][0], chosen[1][0]])[0]
+            return self.source.images(*samples), unpacked(
+                self.dataset.labels[chosen[0][0], chosen[1][0]], self.dataset.robot
+            )[0]
 
         return self._timed("inputs of a batch, a fresh subset of 64 maps included", BATCH, batch)
 
@@ -86,7 +89,7 @@ class Bench:
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}
         state = self.devices.replicate(state)
         maps, trajectories = (index[:STEP_BATCH] for index in self.sampler.epoch(0))
-        failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories])[0], np.float32)
+        failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories], self.dataset.robot)[0], np.float32)
         inputs = self.devices.shard((maps, trajectories, failed, np.ones(STEP_BATCH, np.float32)))
 
         def step():

@@ -32,7 +32,7 @@ def _of_samples(estimator: Estimator, inputs, failed, key):
 
 
 def _of_maps(estimator: HazardField, inputs, targets, key):
-    """Mean over the known trajectories of a map; targets: margins [b, t, 3] in units of the limits, known [b, t]."""
+    """Mean over the known trajectories of a map; targets: margins [b, t, k] in units of the limits, known [b, t]."""
     (elevation, stencil), (margins, known) = inputs, targets
     logits, predicted = estimator(elevation, stencil, train=True)
     off = optax.huber_loss(predicted, jnp.minimum(margins, LARGE_MARGIN), delta=SMALL_ERROR).sum(axis=-1)

@@ -45,8 +45,8 @@ class TrainingData:
         return samples[0][chosen], samples[1][chosen]
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, 3] float32."""
-        return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
+        """Failures of samples: [k, events] float32."""
+        return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
         """Samples of an epoch."""
@@ -57,7 +57,7 @@ class TrainingData:
         return -(-self.count(phase, epoch) // self.config.batch_size)
 
     def batches(self, phase: int, epoch: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Places in `samples` [b], failures [b, 3] and weights [b] of each step, in an order of the epoch's own.
+        """Places in `samples` [b], failures [b, events] and weights [b] of each step, in an order of the epoch's own.
 
         The samples that fill up the last batch have weight 0, but count in its batch statistics.
         """
