@@ -52,11 +52,13 @@ class Robot:
         require(named, "name", self.name, f"a non-empty text of one line, at most {LONGEST_NAME} characters")
         for one in fields(self)[1:]:
             value = getattr(self, one.name)
-            if "angle" not in one.metadata:
-                require_length(one.name, value, 0.001, 100)
-            elif value is not None or "optional" not in one.metadata:
+            if value is None and "optional" in one.metadata:
+                continue
+            if "angle" in one.metadata:
                 allowed = "an angle from 0.01 to 90 degrees (pi/2 rad)"
                 require_number(one.name, value, math.radians(0.0099), math.pi / 2, allowed)
+            else:
+                require_length(one.name, value, 0.001, 100)
         self._require_wheels_outside()
 
     def _require_wheels_outside(self) -> None:

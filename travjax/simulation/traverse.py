@@ -5,7 +5,7 @@ margins of all trajectories -> failures. First arcs are simulated once for all t
 
 On the machine the maps of a batch and their views (footprint.py) lie side by side as the fastest axis, the "lanes", so
 that one table entry reads one row of memory, and a few first arcs at a time are simulated so that their poses stay in
-the cache. What was measured to arrive here is in BUILD_NOTES.md.
+the cache. BUILD_NOTES.md has what was measured to arrive here, footprint.py what the letters in shapes stand for.
 """
 
 from dataclasses import dataclass
@@ -144,10 +144,10 @@ def unpacked(labels, robot: Robot | str | None = None) -> tuple[Bool[Array, "*n 
 )
 @dataclass(frozen=True)
 class _Chunks:
-    """The pose arrays of a NodeTable cut into C chunks of A first arcs, laid out in the order in which they are read.
+    """The pose arrays of a NodeTable cut into chunks, laid out in the order in which they are read.
 
-    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, K / k, A P, 2, k] for k places in
-    one step of the kernel's scan.
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], the steps
+    those of the kernel's scan
     """
 
     wheels: jax.Array
@@ -185,7 +185,7 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
-    """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near NODES_AT_ONCE."""
+    """[C, A P, 2, K] -> [C, steps, A P, 2, places], with about NODES_AT_ONCE places in a step."""
     chunks, poses, _, count = places.shape
     steps = -(-count // NODES_AT_ONCE)
     places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
@@ -219,20 +219,20 @@ def _simulate(
 
 
 def _view_lanes(by_node: jax.Array, views: tuple[View, ...], grid: Grid) -> jax.Array:
-    """[nodes, V n]: the map and its turned and mirrored images side by side."""
+    """[nodes, lanes]: the map and its turned and mirrored images side by side."""
     image = by_node.reshape(*grid.shape, -1)
     return jnp.concatenate([jnp.flip(image, view.flipped) for view in views], axis=-1).reshape(len(by_node), -1)
 
 
 def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
-    """Contact heights of the wheels: [4, P, V n]."""
+    """Contact heights of the wheels: [4, A P, lanes]."""
     heights = by_node.at[wheels].get(mode="promise_in_bounds")
     return heights.reshape(*heights.shape[:2], -1)
 
 
 @dataclass(frozen=True)
 class _Planes:
-    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [P, lanes] each.
+    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [A P, lanes] each.
 
     pitch, roll, steepness: as in events.Pose
     """
@@ -264,7 +264,7 @@ def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: 
 
 
 def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
-    """Largest height of a chassis node above the pose plane: [P, lanes]."""
+    """Largest height of a chassis node above the pose plane: [A P, lanes]."""
     highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
     if not len(chunk.runs):
         return highest
@@ -273,7 +273,7 @@ def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) 
 
 
 def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
-    """Largest height above the pose plane over the places, for each of the `run` nodes of a place: [P, run * lanes]."""
+    """Largest height above the pose plane over the places, of each of the `run` nodes of one: [A P, run * lanes]."""
     nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
     aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
     level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
@@ -293,9 +293,9 @@ def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> 
 def _arc_maxima(
     contact: jax.Array, plane: _Planes, clearance: jax.Array, layout: Layout, events: tuple[Event, ...]
 ) -> jax.Array:
-    """Largest value of each event, and largest height of contacts and chassis nodes, along A first and R second arcs.
+    """Returns the largest value of each event, and the largest height of contacts and chassis nodes, along both arcs.
 
-    Returns [k + 1, A, R, lanes] for k events.
+    [E + 1, A, R, lanes]
     """
     maxima = []
     for poses in _arc_poses(contact, plane, clearance, layout):
@@ -307,7 +307,7 @@ def _arc_maxima(
 
 
 def _arc_poses(contact: jax.Array, plane: _Planes, clearance: jax.Array, layout: Layout) -> tuple[list[Pose], ...]:
-    """The poses along the first arcs, their arrays [A, 1, lanes], and along the second arcs, [A, R, lanes].
+    """Returns the poses along the first arcs, their arrays [A, 1, lanes], and along the second arcs, [A, R, lanes].
 
     What no event asks for is not computed: XLA leaves out what has no use.
     """
