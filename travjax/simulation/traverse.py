@@ -300,7 +300,9 @@ def _arc_maxima(
     maxima = []
     for poses in _arc_poses(contact, plane, clearance, layout):
         values = [reduce(larger, map(event.value, poses)) for event in events]
-        highest = reduce(larger, (height for pose in poses for height in (*pose.contact, pose.clearance)))
+        # Place by place along the arc, so that the obstacle event and this share the maximum of the clearances.
+        ground = zip(*((*pose.contact, pose.clearance) for pose in poses), strict=True)
+        highest = reduce(larger, (reduce(larger, heights) for heights in ground))
         # The barrier keeps XLA from computing the maxima of a first arc anew for each second arc.
         maxima.append(jax.lax.optimization_barrier(jnp.stack([*values, highest])))
     return larger(*maxima)
