@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ import travjax
 from tests.commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 from travjax import cli
 from travjax.commands import label as label_command
+from travjax.config import to_json
 from travjax.data import map_batches
 from travjax.evaluation.tables import shares_table
 from travjax.simulation.actions import ActionSpace
@@ -158,7 +159,7 @@ def test_a_preset_robot_labels_by_its_own_limits(tmp_path, few):
 def test_a_robot_and_actions_of_ones_own_are_taken(tmp_path, few):
     frail = replace(SEEKUR_JR, name="Frail", max_step=1e-3, max_tilt=1.5, track=0.7)
     path = tmp_path / "frail.toml"
-    path.write_text("\n".join(f"{name} = {json.dumps(value)}" for name, value in asdict(frail).items()))
+    path.write_text("\n".join(f"{name} = {json.dumps(value)}" for name, value in to_json(frail).items()))
     done = succeeds(tmp_path / "out", "label", "--count", 1, "--robot", path, "--actions", few, "--no-figures")
     arrays = done.arrays()
     assert "Frail, 18 trajectories a map" in done.out
@@ -427,7 +428,7 @@ def test_up_to_five_maps_are_shown_each_once_and_from_as_many_groups_as_can_be(g
 # ---- Bad input
 
 
-ROBOT = "\n".join(f"{name} = {json.dumps(value)}" for name, value in asdict(SEEKUR_JR).items())
+ROBOT = "\n".join(f"{name} = {json.dumps(value)}" for name, value in to_json(SEEKUR_JR).items())
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import travjax
 
 LAYERS = {
     "": "config signals locks files progress jax_flags batching devices entry",
-    "simulation": "arrays grid heights robot actions footprint traverse reference",
+    "simulation": "arrays grid heights events robot actions footprint traverse reference",
     "terrain": "noise landforms rock_field styles",
     "rasters": "coordinates reading_options memory formats raster gdal_files array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",

@@ -5,9 +5,10 @@ from .data.dem import load_dem
 from .models.input_images import render_inputs
 from .runs.predictor import predict
 from .simulation.actions import ActionSpace
+from .simulation.events import EVENTS, Margins
 from .simulation.grid import Grid
 from .simulation.robot import Robot
-from .simulation.traverse import EVENTS, Margins, failures, label, simulate
+from .simulation.traverse import failures, label, simulate
 from .terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 
 __version__: str

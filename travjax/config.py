@@ -2,7 +2,8 @@
 
 A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
 may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is. A field with the
-metadata `items` is a tuple of configurations of that kind, in the file a list of tables, `[[field]]`.
+metadata `items` is a tuple of configurations of that kind, in the file a list of tables, `[[field]]`. One with the
+metadata `optional` is left out of JSON while it is None.
 """
 
 import dataclasses
@@ -192,7 +193,9 @@ def to_json(config: object) -> dict[str, Any]:
             return [str(item) if item in (math.inf, -math.inf) else item for item in items]
         return value.item() if isinstance(value, np.generic) else value
 
-    return {field.name: plain(getattr(config, field.name)) for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    values = {field: getattr(config, field.name) for field in dataclasses.fields(config)}  # type: ignore[arg-type]
+    left_out = [field for field, value in values.items() if value is None and "optional" in field.metadata]
+    return {field.name: plain(value) for field, value in values.items() if field not in left_out}
 
 
 def from_json(table: Any, kind: type[Config]) -> Config:

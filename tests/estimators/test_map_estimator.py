@@ -15,7 +15,7 @@ from travjax.estimators.inference import Placed
 from travjax.estimators.map_estimator import hazards
 from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import load_estimator
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 

@@ -135,9 +135,9 @@ def test_a_group_without_known_trajectories_has_no_shares(dataset):
 
 def test_labels_are_counted_alike_in_any_chunks(dataset, monkeypatch):
     expected = np.stack([np.bincount(row, minlength=16) for row in dataset.labels])
-    np.testing.assert_array_equal(label_counts(dataset.labels), expected)
+    np.testing.assert_array_equal(label_counts(dataset.labels, 16), expected)
     monkeypatch.setattr(dataset_tables, "MAPS_AT_ONCE", 7)
-    np.testing.assert_array_equal(label_counts(dataset.labels), expected)
+    np.testing.assert_array_equal(label_counts(dataset.labels, 16), expected)
 
 
 def test_the_balanced_subsets_are_those_of_training_and_validation(dataset):

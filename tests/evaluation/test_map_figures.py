@@ -11,9 +11,9 @@ from PIL import Image
 
 from travjax.evaluation import map_figures
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS
 
 SEEKUR_JR = Robot.load("seekur_jr")
 FEW = ActionSpace(turns=4, radii=(math.inf, 1.2, -1.2))

@@ -14,7 +14,7 @@ from sklearn import metrics as sk
 from travjax.config import InputError
 from travjax.evaluation import metrics
 from travjax.evaluation.metrics import NAMES, PAPER_REAL, PAPER_SYNTHETIC, Confusion, evaluate
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 KINDS = {
     "separable in part": dict(share=(0.2, 0.1, 0.3), separation=2.0),

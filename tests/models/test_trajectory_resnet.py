@@ -13,7 +13,7 @@ from travjax.models.trajectory_resnet import HeadsConfig, create
 from travjax.models.variables import VARIABLES, merge_model, split_model
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.network import ResNetConfig
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 IMAGES = np.random.default_rng(0).uniform(-1, 1, (6, 33, 33, 3)).astype(np.float32)
 TRUNK = PRESET.trunk

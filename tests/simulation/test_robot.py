@@ -6,11 +6,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from travjax.config import InputError
+from travjax.config import InputError, from_json, to_json
 from travjax.simulation.robot import Robot
 
 SEEKUR_JR = Robot.load("seekur_jr")
-LENGTHS = [field.name for field in fields(Robot) if field.name not in ("name", "max_tilt")]
+LENGTHS = [field.name for field in fields(Robot) if field.name != "name" and "angle" not in field.metadata]
+NEEDED = [field.name for field in fields(Robot) if field.name != "max_roll"]
 
 
 def as_toml(**changes) -> str:
@@ -84,7 +85,7 @@ def test_a_missing_file_is_named(tmp_path):
         Robot.load(tmp_path / "none.toml")
 
 
-@pytest.mark.parametrize("field", [field.name for field in fields(Robot)])
+@pytest.mark.parametrize("field", NEEDED)
 def test_a_file_without_a_field_is_refused_by_name(tmp_path, field):
     path = tmp_path / "mine.toml"
     path.write_text(as_toml(**{field: None}))
@@ -153,16 +154,39 @@ def test_an_angle_given_in_degrees_is_shown_in_degrees(tmp_path):
             Robot.load(path)
 
 
-def test_a_limit_of_roll_is_told_the_limit_of_tilt(tmp_path):
+def test_a_misspelt_limit_is_told_the_one_that_is_meant(tmp_path):
     path = tmp_path / "mine.toml"
-    path.write_text(as_toml(max_tilt=None) + "\nmax_roll_deg = 30")
-    with pytest.raises(InputError, match="unknown key 'max_roll_deg'; allowed: .*; perhaps max_tilt_deg is meant$"):
+    path.write_text(as_toml(max_tilt=None) + "\nmax_tild_deg = 30")
+    with pytest.raises(InputError, match="unknown key 'max_tild_deg'; allowed: .*; perhaps max_tilt_deg is meant$"):
         Robot.load(path)
 
 
 def test_limits_are_step_obstacle_tilt():
     robot = replace(SEEKUR_JR, max_step=0.1, ride_height=0.2, max_tilt=0.3)
     assert robot.limits == (0.1, 0.2, 0.3)
+    assert robot.event_names == ("step", "obstacle", "tilt")
+
+
+def test_a_limit_of_roll_adds_an_event(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(as_toml() + "\nmax_roll_deg = 15")
+    robot = Robot.load(path)
+    assert robot == replace(SEEKUR_JR, max_roll=math.radians(15))
+    assert robot.event_names == ("step", "obstacle", "tilt", "roll")
+    assert robot.limits == (*SEEKUR_JR.limits, math.radians(15))
+
+
+@pytest.mark.parametrize("value", [0, -0.1, 36.87, math.nan, "0.4", True])
+def test_a_bad_limit_of_roll_is_refused(value):
+    with pytest.raises(InputError, match="^max_roll = .*: must be an angle from 0.01 to 90 degrees"):
+        replace(SEEKUR_JR, max_roll=value)
+
+
+def test_a_robot_without_a_limit_of_roll_is_saved_as_before_there_was_one():
+    assert list(to_json(SEEKUR_JR)) == NEEDED
+    robot = replace(SEEKUR_JR, max_roll=0.3)
+    assert to_json(robot) == to_json(SEEKUR_JR) | {"max_roll": 0.3}
+    assert from_json(to_json(robot), Robot) == robot and from_json(to_json(SEEKUR_JR), Robot) == SEEKUR_JR
 
 
 def test_wheels_stand_front_left_front_right_rear_left_rear_right():

@@ -14,9 +14,10 @@ from tests.conftest import SETTINGS
 from travjax.config import InputError
 from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import EVENTS, Margins
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS, Margins, failures, label, packed, simulate, unpacked
+from travjax.simulation.traverse import failures, label, packed, simulate, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain
 
 SEEKUR_JR = Robot.load("seekur_jr")

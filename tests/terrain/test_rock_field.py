@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from travjax.config import InputError
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
-from travjax.simulation.traverse import EVENTS, failures, simulate
+from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.rock_field import (
     RANGES,
     SITES,

@@ -54,7 +54,7 @@ def logits(graph, variables, elevation, map_index, trajectory_index):
 class PooledEstimator(EstimatorKind):
     phases = {2: Phase(("heads",), loss)}
 
-    def create(self, preset, seed=0, weights=None):
+    def create(self, preset, robot, seed=0, weights=None):
         return Pooled(len(FEW), nnx.Rngs(key_of(seed)))
 
     def source(self, preset, heights, robot, actions, grid, on_progress=lambda count: None):

@@ -45,7 +45,8 @@ from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.traverse import EVENTS, unpacked
+from travjax.simulation.events import EVENTS
+from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
 from travjax.training.trainer import Trainer
 

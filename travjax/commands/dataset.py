@@ -12,7 +12,7 @@ from travjax.config import InputError, one_line, require
 from travjax.data import sites, tfds_export
 from travjax.data.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
 from travjax.data.provenance import SIDES, Site, SitesConfig, Strip
-from travjax.evaluation.dataset_tables import COLUMNS, statistics_table, windows_table
+from travjax.evaluation.dataset_tables import are_headings, statistics_table, windows_table
 from travjax.files import (
     find_preset,
     first_lines,
@@ -128,7 +128,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _are_statistics(path: Path) -> bool:
     """Whether a file holds the tables of a data set: their first line is that of the headings."""
-    return [line.split() for line in first_lines(path, 1)] == [" ".join(COLUMNS.values()).split()]
+    return [are_headings(line) for line in first_lines(path, 1)] == [True]
 
 
 def _print_tables(dataset: Dataset) -> list[str]:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from travjax.evaluation.metrics import Evaluation
     from travjax.models.variables import Network
     from travjax.runs.evaluator import Evaluator
+    from travjax.simulation.robot import Robot
 
 RECALLS = (0.9, 0.99)
 """Recalls that thresholds are found for, unless others are asked for."""
@@ -175,7 +176,6 @@ def _write_tables(
 ) -> None:
     from travjax.evaluation import tables
     from travjax.evaluation.metrics import json_ready
-    from travjax.simulation.traverse import EVENTS
 
     paper = evaluator.paper
     average_precisions = {"network": scores.average_precision}
@@ -190,26 +190,26 @@ def _write_tables(
         tables.baselines_table(average_precisions),
     ]
     if errors is not None:
-        parts += [f"{MARGINS.capitalize()}:\n{tables.metrics_table(others[MARGINS], paper)}", _margin_errors(errors)]
+        parts += [
+            f"{MARGINS.capitalize()}:\n{tables.metrics_table(others[MARGINS], paper)}",
+            _margin_errors(errors, evaluator.run.robot),
+        ]
     text = "\n\n".join(parts)
     print(f"\n{text}\n")
     results = {"sample": description, "network": json_ready(scores)}
     results |= {name: json_ready(other) for name, other in others.items()}
     if errors is not None:
-        results["margin_errors"] = dict(zip(EVENTS, errors.tolist(), strict=True))
+        results["margin_errors"] = dict(zip(evaluator.run.robot.event_names, errors.tolist(), strict=True))
     for name, content in (("tables.txt", text), ("evaluation.json", json.dumps(results, indent=1, allow_nan=False))):
         progress.wrote(save_text(out / name, content + "\n"))
 
 
-def _margin_errors(errors: np.ndarray) -> str:
-    """One line on mean absolute errors [3]."""
+def _margin_errors(errors: np.ndarray, robot: "Robot") -> str:
+    """One line on mean absolute errors [k] of the margins of a robot's events."""
     from travjax.models.hazard_field import LARGE_MARGIN
 
-    step, obstacle, tilt = errors
-    return (
-        f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: step {step:.4f} m, "
-        f"obstacle {obstacle:.4f} m, tilt {np.degrees(tilt):.2f} degrees"
-    )
+    each = ", ".join(f"{event.name} {event.shown(error)}" for event, error in zip(robot.events, errors, strict=True))
+    return f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: {each}"
 
 
 def _draw(
@@ -244,7 +244,7 @@ def _predictions(evaluator: "Evaluator", estimator: "Network", maps: int, sample
     labels = data.labels[shown, ::every]
     with progress.bar("maps for the figure", labels.size, "sample") as bar:
         probability = evaluator.whole_maps(estimator, shown, bar.update, every)
-    failed, known = map(np.asarray, unpacked(labels))
+    failed, known = map(np.asarray, unpacked(labels, trained.robot))
     titles = [f"{one_line(data.group[index], 30)}, map {index}" for index in shown]
     return map_figures.predicted_maps(
         data.heights[shown],

@@ -52,11 +52,11 @@ def run(arguments: argparse.Namespace) -> None:
     noise = not arguments.dem and not are_rock_fields(arguments.style or (), arguments.world)
     as_in_paper = noise and traverse.as_in_paper(robot, actions)
     config = options.configuration_json(robot, actions, grid, files=files, world=arguments.world)
-    with NpzStream(out / "labels.npz", total, bytes_each(actions, grid), "labelled maps") as labels:
+    with NpzStream(out / "labels.npz", total, bytes_each(robot, actions, grid), "labelled maps") as labels:
         for batch in options.progress((labelled(batch, robot, actions, grid) for batch in source), total, "labelling"):
             labels.append(batch)
         maps = labels.arrays
-        table = tables.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper)
+        table = tables.shares_table(maps["group"], maps["failed"], maps["known"], as_in_paper, robot.event_names)
         labels.save(config=config, cell_size=grid.spacing)
         shares = save_text(out / "shares.txt", table + "\n")
         print(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")

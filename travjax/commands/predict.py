@@ -1,7 +1,7 @@
 """`travjax predict`: probabilities of failure for every trajectory of maps, by a trained estimator."""
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,6 @@ from travjax.data.map_batches import Batch, bytes_each, labelled, samples, title
 from travjax.data.npz_stream import NpzStream
 from travjax.estimators.names import ESTIMATORS
 from travjax.files import output_folder, save_text, user_path
-from travjax.simulation.traverse import EVENTS
 
 if TYPE_CHECKING:
     from travjax.runs.predictor import Predictor
@@ -74,17 +73,20 @@ def run(arguments: argparse.Namespace) -> None:
     config = options.configuration_json(
         trained.robot, trained.actions, trained.grid, files=files, model=model, world=arguments.world
     )
-    size = bytes_each(trained.actions, trained.grid) + len(trained.actions) * 6 * 4
+    size = (
+        bytes_each(trained.robot, trained.actions, trained.grid)
+        + len(trained.actions) * len(trained.robot.events) * 2 * 4
+    )
     with NpzStream(out / "predictions.npz", total, size, "predicted maps") as predictions:
         with progress.bar("predicting", total * len(trained.actions), "trajectory") as bar:
             for batch in source:
                 predictions.append(_predicted(batch, predictor, bar.update))
         maps = predictions.arrays
         fails = maps["probability"] >= PROBABILITY
-        table = tables.shares_table(maps["group"], fails, maps["known"], as_in_paper=False)
+        table = tables.shares_table(maps["group"], fails, maps["known"], False, trained.robot.event_names)
         text = f"Predicted to fail, {trained.robot.name}, {len(trained.actions)} trajectories a map, {model}:\n{table}"
         if arguments.check:
-            text += f"\n\n{_checked(maps)}"
+            text += f"\n\n{_checked(maps, trained.robot.event_names)}"
         unsaved = ("heights",) if arguments.check else ("heights", "failed")
         saved = predictions.save(unsaved, config=config, cell_size=trained.grid.spacing)
         shares = save_text(out / "shares.txt", f"{text}\n")
@@ -102,16 +104,18 @@ def _predicted(batch: Batch, predictor: "Predictor", on_progress: Callable[[int]
     kept = ("heights", "group", "known", "failed", "origin", "height_offset", "crs", "seed")
     found = {name: simulated[name] for name in kept if name in simulated} | {"probability": predicted.probability}
     if predicted.margins is not None:
-        found |= {f"margin_{name}": predicted.margins[..., event] for event, name in enumerate(EVENTS)}
+        found |= {
+            f"margin_{name}": predicted.margins[..., event] for event, name in enumerate(trained.robot.event_names)
+        }
     return found
 
 
-def _checked(maps: Batch) -> str:
+def _checked(maps: Batch, events: Sequence[str]) -> str:
     """The predictions against the simulator on the maps as given; on noisy ones that is not what a robot meets."""
     from travjax.evaluation import metrics, tables
 
     known = maps["known"]
-    scores = metrics.evaluate(maps["probability"][known], maps["failed"][known])
+    scores = metrics.evaluate(maps["probability"][known], maps["failed"][known], events=events)
     return f"{AGAINST}:\n{tables.metrics_table(scores, None)}"
 
 

@@ -216,10 +216,11 @@ def _draw_inputs(trainer: "Trainer", folder: Path) -> Path:
 def _finish(folder: Path) -> None:
     """The figure of the run, and where everything is."""
     from travjax.evaluation import map_figures, score_figures
+    from travjax.runs.run import Run
     from travjax.runs.run_log import read_rows
 
-    rows = folder / "metrics.jsonl"
+    rows, events = folder / "metrics.jsonl", Run.load(folder).robot.event_names
     progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         progress.wrote(path)
-    progress.wrote(map_figures.save(score_figures.training_figure(read_rows(rows)), folder / "training.png"))
+    progress.wrote(map_figures.save(score_figures.training_figure(read_rows(rows), events), folder / "training.png"))

@@ -31,9 +31,10 @@ from travjax.config import (
 )
 from travjax.data.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, read_table
 from travjax.data.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
-from travjax.data.sampling import UNKNOWN_LABEL, random_keys
+from travjax.data.sampling import random_keys
 from travjax.files import atomic_write_folder, put_back, sha256, user_path
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import label_codes
 from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -167,7 +168,8 @@ class Dataset:
         wrong = self.split[self.split >= len(SPLITS)]
         require(not wrong.size, "split", wrong[:1].tolist(), f"from 0 to {len(SPLITS) - 1}: {', '.join(SPLITS)}")
         largest = int(self.labels.max(initial=0))
-        require(largest < 2 * UNKNOWN_LABEL, "labels", largest, f"from 0 to {2 * UNKNOWN_LABEL - 1}")
+        codes = label_codes(len(self.robot.events))
+        require(largest < codes, "labels", largest, f"from 0 to {codes - 1}")
         groups = STYLES if self.config else self.provenance and [site.name for site in self.provenance.sites]
         unknown = self.group[~np.isin(self.group, groups)] if groups else self.group[:0]
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")

@@ -4,7 +4,6 @@ A batch is a dict of arrays with a common leading axis: `heights` [n, rows, cols
 else tells its maps apart, and, once labelled, the margins, `known` and `failed`.
 """
 
-import dataclasses
 from collections.abc import Iterable, Iterator
 
 import numpy as np
@@ -67,7 +66,7 @@ def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
 
 
 def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Batch:
-    """The batch with `step`, `obstacle`, `tilt` and `known` [n, t] and `failed` [n, t, 3].
+    """The batch with `known` and a margin by the name of each of the robot's k events [n, t], and `failed` [n, t, k].
 
     Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
     """
@@ -75,13 +74,14 @@ def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Ba
     numbers = np.isfinite(np.asarray(margins.events())).all(axis=-1)
     allowed = "finite where the ground is known"
     require(bool((numbers | ~np.asarray(margins.known)).all()), f"margins of {robot.name}", "NaN or infinity", allowed)
-    arrays = dataclasses.asdict(margins) | {"failed": failures(margins, robot)}
+    arrays = {name: margins[name] for name in margins.names}
+    arrays |= {"known": margins.known, "failed": failures(margins, robot)}
     return batch | {name: np.asarray(array) for name, array in arrays.items()}
 
 
-def bytes_each(actions: ActionSpace, grid: Grid) -> int:
-    """Returns how much a labelled map takes: heights, three margins, `known` and three flags a trajectory."""
-    return 4 * grid.nodes**2 + len(actions) * (3 * 4 + 1 + 3)
+def bytes_each(robot: Robot, actions: ActionSpace, grid: Grid) -> int:
+    """Returns how much a labelled map takes: heights, and of a trajectory a margin and a flag an event and `known`."""
+    return 4 * grid.nodes**2 + len(actions) * (5 * len(robot.events) + 1)
 
 
 def joined(batches: list[Batch]) -> Batch:

@@ -15,12 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from travjax.config import InputError, require
-
-FAILED = 0b0111
-"""The bits of a label that say step, obstacle or tilt failed."""
-
-UNKNOWN_LABEL = 0b1000
-"""The bit of a label that says unknown."""
+from travjax.simulation.events import FAILED, UNKNOWN_LABEL
 
 MAPS_AT_ONCE = 256
 """Maps whose labels are looked at together: 256 x 3042 keys of 8 bytes are 6 MB."""
@@ -42,7 +37,7 @@ def balanced_subset(labels: np.ndarray, maps: np.ndarray, seed: Seed, each: int 
     require(0 <= failing <= each, "failing", failing, f"from 0 to each = {each}")
 
     def chosen(chunk: np.ndarray, keys: np.ndarray) -> np.ndarray:
-        fails, known = (chunk & FAILED) > 0, chunk < UNKNOWN_LABEL
+        fails, known = (chunk & FAILED) > 0, are_known(chunk)
         failed = _smallest(keys, fails & known, failing)
         safe = _smallest(keys, ~fails & known, each)
         room = each - (failed >= 0).sum(axis=1, keepdims=True)
@@ -61,13 +56,18 @@ def natural_sample(labels: np.ndarray, maps: np.ndarray, seed: Seed, number_of_m
     require(1 <= each, "each", each, "at least 1 trajectory a map")
     maps = _map_indices(labels, maps)
     drawn = np.argsort(random_keys(("natural maps", seed), maps), kind="stable")[:number_of_maps]
-    choose = lambda chunk, keys: _smallest(keys, chunk < UNKNOWN_LABEL, each)
+    choose = lambda chunk, keys: _smallest(keys, are_known(chunk), each)
     return _chosen(labels, maps[np.sort(drawn)], ("natural", seed), choose)
 
 
 def every_sample(labels: np.ndarray, maps: np.ndarray) -> Samples:
     """Every known trajectory of the maps: labels [n, t] uint8, maps [k] indices."""
-    return _joined(_pairs(part, labels[part] < UNKNOWN_LABEL) for part in _chunks(_map_indices(labels, maps)))
+    return _joined(_pairs(part, are_known(labels[part])) for part in _chunks(_map_indices(labels, maps)))
+
+
+def are_known(labels: np.ndarray) -> np.ndarray:
+    """Which of some labels are of known trajectories."""
+    return (labels & UNKNOWN_LABEL) == 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,10 +24,11 @@ from travjax.config import InputError
 from travjax.data.dataset import MAPS_AT_ONCE, Dataset, Progress
 from travjax.data.dem import Windows, load_dem
 from travjax.data.provenance import SPLITS, Provenance, Site, SiteRecord, SitesConfig, Strip
-from travjax.data.sampling import UNKNOWN_LABEL
+from travjax.data.sampling import are_known
 from travjax.files import find_data
 from travjax.rasters.coordinates import is_local, places
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import UNKNOWN_LABEL
 from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -70,7 +71,8 @@ def read(
     for some, heights in windows.batches():
         enough = np.isnan(heights).mean(axis=(1, 2)) <= config.max_unknown
         labels[some[enough]] = label(heights[enough])
-    assignment = _assignments(config, windows, labels.min(axis=1) < UNKNOWN_LABEL, grid.size)
+    known = np.asarray(are_known(labels).any(axis=1))
+    assignment = _assignments(config, windows, known, grid.size)
     records = _records(config, found, windows.site, assignment)
     _require_all(config, records, found, grid.size)
 

@@ -5,9 +5,9 @@
     source[0]["elevation"]
 
 One example is one map: `elevation` [rows, cols] float32 metres, NaN unknown; `labels` [t] uint8, of each trajectory's
-byte bits 0 to 2 say that step, obstacle and tilt failed, bit 3 unknown; `style`, or the site of a real map; `seed` of
-its terrain; `map`, its index in the data set; of a real map `origin` and `quarter_turns` as in provenance.py. All that
-is not an array is in the builder's metadata.
+byte bits 0 to 2 say that step, obstacle and tilt failed, bit 3 unknown, bits 4 to 7 that further events of the robot
+did; `style`, or the site of a real map; `seed` of its terrain; `map`, its index in the data set; of a real map `origin`
+and `quarter_turns` as in provenance.py. All that is not an array is in the builder's metadata.
 """
 
 import shutil

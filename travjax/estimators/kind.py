@@ -50,7 +50,7 @@ class TrainingData(Protocol):
     def samples(self, phase: int, epoch: int) -> Samples:
         """Returns the training samples of an epoch."""
 
-    def failed(self, samples: Samples) -> Float[np.ndarray, "k 3"]:
+    def failed(self, samples: Samples) -> Float[np.ndarray, "k e"]:
         """Returns the failures of samples."""
 
     def count(self, phase: int, epoch: int) -> int:
@@ -75,7 +75,7 @@ class FrozenTrunk:
     """
 
     features: Callable[[Placed, Samples, int, Progress], Float[np.ndarray, "k f"]]
-    logits: Callable[[nnx.GraphDef, Variables, Float[Array, "b f"]], Float[Array, "b 3"]]
+    logits: Callable[[nnx.GraphDef, Variables, Float[Array, "b f"]], Float[Array, "b e"]]
 
 
 def beside_source(source: PyTree, inputs: tuple, devices: Devices) -> tuple:
@@ -116,7 +116,7 @@ class EstimatorKind(Protocol):
     reads_whole_maps: bool = False
     sees_images: bool = False
 
-    def create(self, preset: Preset, seed: int = 0, weights: Weights | None = None) -> Network:
+    def create(self, preset: Preset, robot: Robot, seed: int = 0, weights: Weights | None = None) -> Network:
         """Makes the network with random parameters, or with a trunk of `weights`.
 
         Raises InputError for weights that are not for it.
@@ -141,7 +141,7 @@ class EstimatorKind(Protocol):
 
     def logits(
         self, placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
-    ) -> Float[np.ndarray, "k 3"]:
+    ) -> Float[np.ndarray, "k e"]:
         """Returns the logits of k samples, so many at once; on_progress: is told of samples.
 
         Raises NoNumbers when one of them is NaN or infinite.
@@ -149,7 +149,7 @@ class EstimatorKind(Protocol):
 
     def of_maps(
         self, placed: Placed, maps: np.ndarray, trajectories: int, on_progress: Progress = lambda count: None
-    ) -> tuple[Float[np.ndarray, "m t 3"], Float[np.ndarray, "m t 3"] | None]:
+    ) -> tuple[Float[np.ndarray, "m t e"], Float[np.ndarray, "m t e"] | None]:
         """Returns logits and, if it puts them out, margins in units of the robot's limits of all trajectories of maps.
 
         on_progress: is told of samples. Raises as `logits` does.

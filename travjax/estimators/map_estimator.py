@@ -38,7 +38,7 @@ def _loss(network: HazardField, inputs, targets, key: Key[Array, ""]) -> Float[A
     """Returns the mean over the known trajectories of each map.
 
     inputs:  elevation [b, rows, cols] and the stencil of t trajectories
-    targets: margins [b, t, 3] in units of the limits, known [b, t]
+    targets: margins [b, t, e] in units of the limits, known [b, t]
     """
     (elevation, stencil), (margins, known) = inputs, targets
     logits, predicted = network(elevation, stencil, train=True)
@@ -57,12 +57,12 @@ def _place(source: MapSource, inputs, devices: Devices):
 @partial(jax.jit, static_argnames="graph")
 def map_hazards(
     graph: nnx.GraphDef, variables: Variables, source: MapSource, map_index: Int[Array, " b"]
-) -> Float[Array, "b t 6"]:
+) -> Float[Array, "b t h"]:
     """Returns logits, then margins in units of the limits, of all trajectories of maps."""
     return jnp.concatenate(merge_model(graph, variables)(source.elevation(map_index), source.stencil), axis=-1)
 
 
-def hazards(placed: Placed, maps: np.ndarray, on_progress: Progress = lambda count: None) -> Float[np.ndarray, "m t 6"]:
+def hazards(placed: Placed, maps: np.ndarray, on_progress: Progress = lambda count: None) -> Float[np.ndarray, "m t h"]:
     """Returns `map_hazards` of maps [m], on the host; on_progress: is told of maps."""
     count = placed.devices.mesh.size
     size = min(MAPS, -(-len(maps) // count)) * count  # a single map is not read four times
@@ -77,10 +77,10 @@ class MapEstimator(EstimatorKind):
     largest_margin = LARGE_MARGIN
     reads_whole_maps = True
 
-    def create(self, preset: Preset, seed: int = 0, weights: Weights | None = None) -> HazardField:
+    def create(self, preset: Preset, robot: Robot, seed: int = 0, weights: Weights | None = None) -> HazardField:
         """Makes the network with random parameters; raises InputError where it is to begin with others."""
         require(weights is None, "weights", preset.weights, '"none": the hazard field begins with random ones')
-        return create(preset.field, seed)
+        return create(preset.field, seed, len(robot.events))
 
     def source(
         self,
@@ -100,16 +100,16 @@ class MapEstimator(EstimatorKind):
 
     def logits(
         self, placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
-    ) -> Float[np.ndarray, "k 3"]:
+    ) -> Float[np.ndarray, "k e"]:
         """Returns the logits of samples, from the hazard field of each of their maps, whatever the batch size."""
         maps, place = np.unique(samples[0], return_inverse=True)
         each = len(place) // len(maps)
         added = hazards(placed, maps, lambda count: on_progress(count * each))
-        return added[place, samples[1], :3]
+        return added[place, samples[1], : added.shape[-1] // 2]
 
     def of_maps(
         self, placed: Placed, maps: np.ndarray, trajectories: int, on_progress: Progress = lambda count: None
-    ) -> tuple[Float[np.ndarray, "m t 3"], Float[np.ndarray, "m t 3"]]:
+    ) -> tuple[Float[np.ndarray, "m t e"], Float[np.ndarray, "m t e"]]:
         """Returns logits and margins in units of the robot's limits of all trajectories of maps."""
         logits, margins = np.split(hazards(placed, maps, lambda count: on_progress(count * trajectories)), 2, axis=-1)
         return logits, margins

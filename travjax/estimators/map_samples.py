@@ -86,8 +86,8 @@ class MapSamples:
         return every_sample(self.dataset.labels, self.maps)
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, 3] float32."""
-        return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
+        """Failures of samples: [k, events] float32."""
+        return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
         """Maps of an epoch."""

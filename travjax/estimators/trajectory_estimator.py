@@ -26,20 +26,20 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
 
-def _loss(network: Estimator, inputs, failed: Float[Array, "b 3"], key: Key[Array, ""]) -> Float[Array, " b"]:
+def _loss(network: Estimator, inputs, failed: Float[Array, "b e"], key: Key[Array, ""]) -> Float[Array, " b"]:
     """Returns the cross-entropy summed over the events; inputs: the source, and maps and trajectories [b]."""
     source, map_index, trajectory_index = inputs
     return _entropy(network(source.images(map_index, trajectory_index), train=True, key=key), failed)
 
 
 def _loss_of_heads(
-    network: Estimator, features: Float[Array, "b f"], failed: Float[Array, "b 3"], key: Key[Array, ""]
+    network: Estimator, features: Float[Array, "b f"], failed: Float[Array, "b e"], key: Key[Array, ""]
 ) -> Float[Array, " b"]:
     """Returns that of the heads on the trunk's features."""
     return _entropy(network.heads(features, key), failed)
 
 
-def _entropy(logits: Float[Array, "b 3"], failed: Float[Array, "b 3"]) -> Float[Array, " b"]:
+def _entropy(logits: Float[Array, "b e"], failed: Float[Array, "b e"]) -> Float[Array, " b"]:
     return optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1)
 
 
@@ -50,7 +50,7 @@ def sample_logits(
     source: ImageSource,
     map_index: Int[Array, " b"],
     trajectory_index: Int[Array, " b"],
-) -> Float[Array, "b 3"]:
+) -> Float[Array, "b e"]:
     """Returns the logits of samples."""
     return merge_model(graph, variables)(source.images(map_index, trajectory_index))
 
@@ -68,7 +68,7 @@ def sample_features(
 
 
 @partial(jax.jit, static_argnames="graph")
-def feature_logits(graph: nnx.GraphDef, variables: Variables, features: Float[Array, "b f"]) -> Float[Array, "b 3"]:
+def feature_logits(graph: nnx.GraphDef, variables: Variables, features: Float[Array, "b f"]) -> Float[Array, "b e"]:
     """Returns the logits of features of the trunk."""
     return merge_model(graph, variables).heads(features)
 
@@ -89,9 +89,9 @@ class TrajectoryEstimator(EstimatorKind):
     }
     sees_images = True
 
-    def create(self, preset: Preset, seed: int = 0, weights: Weights | None = None) -> Estimator:
+    def create(self, preset: Preset, robot: Robot, seed: int = 0, weights: Weights | None = None) -> Estimator:
         """Makes the network; raises InputError for weights of another trunk."""
-        return create(preset.trunk, preset.heads, seed, weights)
+        return create(preset.trunk, preset.heads, seed, weights, robot.event_names)
 
     def source(
         self,
@@ -111,6 +111,6 @@ class TrajectoryEstimator(EstimatorKind):
 
     def logits(
         self, placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
-    ) -> Float[np.ndarray, "k 3"]:
+    ) -> Float[np.ndarray, "k e"]:
         """Returns the logits of samples, one image each."""
         return over_samples(sample_logits, placed, samples, batch_size, on_progress)

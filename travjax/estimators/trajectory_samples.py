@@ -47,8 +47,8 @@ class TrajectorySamples:
         return samples[0][chosen], samples[1][chosen]
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, 3] float32."""
-        return np.asarray(unpacked(self.dataset.labels[samples])[0], np.float32)
+        """Failures of samples: [k, events] float32."""
+        return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
         """Samples of an epoch."""
@@ -62,7 +62,7 @@ class TrajectorySamples:
         """Yields the batches of an epoch from the first-th on, in an order of the epoch's own.
 
         inputs:  maps [b] and trajectories [b]; in phase 1 places in `samples` [b]
-        targets: failures [b, 3]
+        targets: failures [b, events]
         The samples that fill up the last batch have weight 0, but count in its batch statistics.
         """
         samples = self.samples(phase, epoch)

@@ -10,18 +10,10 @@ import numpy as np
 from travjax.config import to_json
 from travjax.data.dataset import SPLITS, Dataset
 from travjax.data.provenance import Provenance
-from travjax.data.sampling import FAILED, MAPS_AT_ONCE, UNKNOWN_LABEL, Samples, balanced_subset
-from travjax.evaluation.tables import PAPER_SHARES, rows_table
-from travjax.simulation.traverse import EVENTS
-
-COLUMNS = {
-    "what": "",
-    "maps": "maps",
-    "samples": "samples",
-    **{name: name for name in PAPER_SHARES},
-    "none": "maps with none",
-    "known": "known",
-}
+from travjax.data.sampling import MAPS_AT_ONCE, Samples, are_known, balanced_subset
+from travjax.evaluation.tables import ANY, PAPER_SHARES, rows_table
+from travjax.simulation.events import EVENTS, FAILED, label_bit, label_codes
+from travjax.simulation.robot import Robot
 
 WINDOW_COLUMNS = {
     "name": "site",
@@ -35,8 +27,18 @@ WINDOW_COLUMNS = {
     "shared": "left out:\nshared",
 }
 
-CODES = 2 * UNKNOWN_LABEL
-"""A label is a number below this."""
+
+def columns_of(robot: Robot) -> dict[str, str]:
+    """Keys and headings of the columns of `statistics_table` for a robot's data set."""
+    same = {name: name for name in ("maps", "samples", *robot.event_names, ANY)}
+    return {"what": ""} | same | {"none": "maps with none", "known": "known"}
+
+
+def are_headings(line: str) -> bool:
+    """Whether a line is the first one of `statistics_table`, for a robot of any events."""
+    first, last = ["maps", "samples", *EVENTS], [*ANY.split(), "maps", "with", "none", "known"]
+    words = line.split()
+    return words[: len(first)] == first and words[len(first) :][-len(last) :] == last
 
 
 def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True) -> str:
@@ -44,28 +46,29 @@ def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None
 
     subsets: what to call them, and their samples; the balanced subsets of training and validation unless given
     """
-    return rows_table(statistics_rows(dataset, subsets, as_in_paper), COLUMNS)
+    return rows_table(statistics_rows(dataset, subsets, as_in_paper), columns_of(dataset.robot))
 
 
 def statistics_rows(
     dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True
 ) -> Iterator[dict]:
     """The rows of `statistics_table`; a site of several splits has one for each of them as well."""
-    counts = label_counts(dataset.labels)
+    robot = dataset.robot
+    counts = label_counts(dataset.labels, label_codes(len(robot.events)))
     for name in dict.fromkeys(dataset.group.tolist()):
         members = dataset.group == name
-        yield _row(name, counts[members])
+        yield _row(name, counts[members], robot)
         splits = np.unique(dataset.split[members]) if dataset.config is None else ()
         for index in splits if len(splits) > 1 else ():
-            yield _row(f"{name}, {SPLITS[index]}", counts[members & (dataset.split == index)])
-    yield _row("all maps", counts)
+            yield _row(f"{name}, {SPLITS[index]}", counts[members & (dataset.split == index)], robot)
+    yield _row("all maps", counts, robot)
     for index, name in enumerate(SPLITS):
-        yield _row(name, counts[dataset.split == index])
+        yield _row(name, counts[dataset.split == index], robot)
     if as_in_paper:
         shares = {name: f"{share:.2%}" for name, share in PAPER_SHARES.items()}
-        yield dict.fromkeys(COLUMNS) | {"what": "paper's test set"} | shares
+        yield dict.fromkeys(columns_of(robot)) | {"what": "paper's test set"} | shares
     for name, samples in (balanced_subsets(dataset) if subsets is None else subsets).items():
-        yield _subset_row(name, dataset.labels, samples)
+        yield _subset_row(name, dataset.labels, samples, robot)
 
 
 def windows_table(provenance: Provenance) -> str:
@@ -86,43 +89,44 @@ def balanced_subsets(dataset: Dataset) -> dict[str, Samples]:
     return {f"{name}, balanced": balanced_subset(dataset.labels, dataset.maps_of(name), seed) for name in splits}
 
 
-def label_counts(labels: np.ndarray) -> np.ndarray:
-    """How often each label occurs on each map: labels [n, t] uint8, result [n, 16]."""
-    counts = np.zeros((len(labels), CODES), np.int64)
+def label_counts(labels: np.ndarray, codes: int) -> np.ndarray:
+    """How often each label below `codes` occurs on each map: labels [n, t] uint8, result [n, codes]."""
+    counts = np.zeros((len(labels), codes), np.int64)
     for start in range(0, len(labels), MAPS_AT_ONCE):
         chunk = labels[start : start + MAPS_AT_ONCE]
-        places = np.arange(len(chunk))[:, None] * CODES + chunk
-        counts[start : start + MAPS_AT_ONCE] = np.bincount(places.ravel(), minlength=chunk.shape[0] * CODES).reshape(
-            -1, CODES
-        )
+        places = np.arange(len(chunk))[:, None] * codes + chunk
+        counted = np.bincount(places.ravel(), minlength=len(chunk) * codes)
+        counts[start : start + MAPS_AT_ONCE] = counted.reshape(-1, codes)
     return counts
 
 
-def _row(name: str, counts: np.ndarray) -> dict:
-    """The shares of maps with these counts [n, 16]."""
-    known = counts[:, :UNKNOWN_LABEL].sum(axis=1)
-    fails = counts[known > 0, 1:UNKNOWN_LABEL].sum(axis=1)
+def _row(name: str, counts: np.ndarray, robot: Robot) -> dict:
+    """The shares of maps with these counts [n, codes]."""
+    codes = np.arange(counts.shape[1])
+    known = counts[:, are_known(codes)].sum(axis=1)
+    fails = counts[known > 0][:, are_known(codes) & (codes > 0)].sum(axis=1)
     total = counts.sum()
     return {
         "what": name,
         "maps": len(counts),
         "samples": int(known.sum()),
-        **_shares(counts.sum(axis=0)),
+        **_shares(counts.sum(axis=0), robot),
         "none": f"{(fails == 0).mean():.1%}" if len(fails) else "-",
         "known": f"{known.sum() / total:.1%}" if total else "-",
     }
 
 
-def _subset_row(name: str, labels: np.ndarray, samples: Samples) -> dict:
+def _subset_row(name: str, labels: np.ndarray, samples: Samples, robot: Robot) -> dict:
     maps, trajectories = samples
-    counts = np.bincount(labels[maps, trajectories], minlength=CODES)
+    counts = np.bincount(labels[maps, trajectories], minlength=label_codes(len(robot.events)))
     size = {"what": name, "maps": len(np.unique(maps)), "samples": len(maps)}
-    return dict.fromkeys(COLUMNS) | size | _shares(counts)
+    return dict.fromkeys(columns_of(robot)) | size | _shares(counts, robot)
 
 
-def _shares(counts: np.ndarray) -> dict[str, str]:
-    """The share of each event and of any among known trajectories, from how often each label occurs: [16]."""
-    codes, known = np.arange(UNKNOWN_LABEL), counts[:UNKNOWN_LABEL].sum()
-    wanted = [1 << event for event in range(len(EVENTS))] + [FAILED]
-    shares = [counts[:UNKNOWN_LABEL][(codes & bits) > 0].sum() for bits in wanted]
-    return {name: f"{share / known:.2%}" if known else "-" for name, share in zip(PAPER_SHARES, shares, strict=True)}
+def _shares(counts: np.ndarray, robot: Robot) -> dict[str, str]:
+    """The share of each event and of any among known trajectories, from how often each label occurs: [codes]."""
+    codes = np.arange(len(counts))
+    total = counts[are_known(codes)].sum()
+    wanted = {name: 1 << label_bit(event) for event, name in enumerate(robot.event_names)} | {ANY: FAILED}
+    fails = {name: counts[are_known(codes) & ((codes & bits) > 0)].sum() for name, bits in wanted.items()}
+    return {name: f"{count / total:.2%}" if total else "-" for name, count in fails.items()}

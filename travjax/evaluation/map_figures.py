@@ -21,7 +21,6 @@ from travjax.files import atomic_write
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS
 
 SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR = "#2a9d3a", "#f2c40f", "#d62718", "#8a8a8a"
 DOUBT, FAILURE = 0.25, 0.5
@@ -78,18 +77,19 @@ def labelled_maps(
 ) -> Figure:
     """For each map the elevation and, for each event, the action space coloured safe, failed or unknown.
 
-    heights: [n, rows, cols]; failed: [n, t, 3]; known: [n, t]. The paper's qualitative figure.
+    heights: [n, rows, cols]; failed: [n, t, k] of the robot's k events; known: [n, t]. The paper's qualitative figure.
     """
     paths = actions.poses(np.arange(len(actions)))[..., :2]
-    figure = Figure(figsize=(13, 3.2 * len(heights) + 0.7), layout="constrained")
-    axes = figure.subplots(len(heights), 4, sharex=True, sharey=True, squeeze=False)
+    columns = 1 + len(robot.events)
+    figure = Figure(figsize=(3.25 * columns, 3.2 * len(heights) + 0.7), layout="constrained")
+    axes = figure.subplots(len(heights), columns, sharex=True, sharey=True, squeeze=False)
     for row, one in enumerate(heights):
         low, high = _colour_range(one)
         image = _draw_elevation(axes[row, 0], one, grid, low, high)
         _draw_robot(axes[row, 0], robot)
         figure.colorbar(image, ax=axes[row, 0], shrink=0.85, label="elevation [m]")
         axes[row, 0].set_title(titles[row], fontsize=9)
-        for event, name in enumerate(EVENTS):
+        for event, name in enumerate(robot.event_names):
             ax = axes[row, 1 + event]
             _draw_elevation(ax, one, grid, low, high, colour="gray", alpha=0.35)
             _draw_paths(ax, paths, _by_label(failed[row, :, event], known[row]))
@@ -117,14 +117,14 @@ def predicted_maps(
 ) -> Figure:
     """For each map the elevation and, for each event, the action space as predicted and in the last row as labelled.
 
-    heights: [n, rows, cols]; predictions: named probabilities [n, t, 3], a row each; failed: [n, t, 3], None if that is
-    not to be shown; known: [n, t]; labelled: what the last row is called; every: t are every so many of the action
-    space. The paper's qualitative figure.
+    heights: [n, rows, cols]; predictions: named probabilities [n, t, k] of the robot's k events, a row each; failed:
+    [n, t, k], None if that is not to be shown; known: [n, t]; labelled: what the last row is called; every: t are every
+    so many of the action space. The paper's qualitative figure.
     """
     paths = actions.poses(np.arange(0, len(actions), every))[..., :2]
-    rows = len(predictions) + (failed is not None)
-    figure = Figure(figsize=(13, 3.15 * rows * len(heights) + 0.5), layout="constrained")
-    axes = figure.subplots(rows * len(heights), 4, sharex=True, sharey=True, squeeze=False)
+    rows, columns = len(predictions) + (failed is not None), 1 + len(robot.events)
+    figure = Figure(figsize=(3.25 * columns, 3.15 * rows * len(heights) + 0.5), layout="constrained")
+    axes = figure.subplots(rows * len(heights), columns, sharex=True, sharey=True, squeeze=False)
     for one in range(len(heights)):
         of_map = axes[rows * one : rows * (one + 1)]
         left = of_map[0, 0]
@@ -136,9 +136,9 @@ def predicted_maps(
         left.tick_params(labelbottom=True)
         for ax in of_map[1:, 0]:
             ax.axis("off")
-        for event, name in enumerate(EVENTS):
-            columns = [(what, values[one, :, event]) for what, values in predictions.items()]
-            drawn = [(what, p >= FAILURE, _by_probability(p, known[one])) for what, p in columns]
+        for event, name in enumerate(robot.event_names):
+            predicted = [(what, values[one, :, event]) for what, values in predictions.items()]
+            drawn = [(what, p >= FAILURE, _by_probability(p, known[one])) for what, p in predicted]
             if failed is not None:
                 fails = failed[one, :, event]
                 drawn.append((labelled, fails, _by_label(fails, known[one])))
@@ -247,7 +247,9 @@ def robot_figure(robot: Robot) -> Figure:
     _dimension(side, (-1.4 * edge, 0), (-1.4 * edge, robot.ride_height), "ride height", (0, 5))
     _dimension(side, (1.5 * edge, 0), (1.5 * edge, robot.max_step), "largest step", (0, 5))
     _dimension(side, (-radius - axle, -0.5 * radius), (radius - axle, -0.5 * radius), "wheel diameter", (0, -5))
-    side.set(title=f"side; largest tilt {np.degrees(robot.max_tilt):.1f} deg", xlabel="forward [m]", ylabel="up [m]")
+    angles = [(event.name, getattr(robot, event.limit)) for event in robot.events if event.unit == "rad"]
+    largest = "".join(f"; largest {name} {np.degrees(limit):.1f} deg" for name, limit in angles)
+    side.set(title=f"side{largest}", xlabel="forward [m]", ylabel="up [m]")
     reach = 1.05 * max(robot.overall_length, robot.overall_width)
     plan.set(xlim=(-reach, reach), ylim=(-reach, reach))
     side.set(xlim=(-2.2 * edge, 2.2 * edge), ylim=(-1.6 * radius, 1.2 * edge))

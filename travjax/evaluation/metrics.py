@@ -1,7 +1,7 @@
 """How good predicted probabilities are: confusion, recall, average precision, calibration (SPEC section 10).
 
 A sample is predicted to fail where its probability is at least the threshold, here and in everything that is printed.
-Probabilities and failures are [s, 3], events in the order of EVENTS; "overall" pools the three events (micro-average).
+Probabilities and failures are [s, k], events in the order of the robot's; "overall" pools the events (micro-average).
 Where no sample fails, recall, precision, F1 and average precision are undefined: NaN. Only NumPy is needed.
 """
 
@@ -14,13 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from travjax.config import require, require_number
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 OVERALL = "overall"
 NAMES = (*EVENTS, OVERALL)
 THRESHOLD = 0.5
 CURVE_POINTS = 300
 """Points of a precision-recall curve that an Evaluation keeps."""
+
+Columns = dict[str, tuple[np.ndarray, np.ndarray]]
+"""Probabilities and failures by event, and of all events together."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ def _ratio(part: float, whole: float) -> float:
 
 def with_overall(confusions: Mapping[str, Confusion]) -> dict[str, Confusion]:
     """The confusions of the events and "overall", their sum."""
-    total = sum((confusions[event] for event in EVENTS), Confusion(0, 0, 0, 0))
-    return {**{event: confusions[event] for event in EVENTS}, OVERALL: total}
+    return {**confusions, OVERALL: sum(confusions.values(), Confusion(0, 0, 0, 0))}
 
 
 PAPER_SYNTHETIC = with_overall(
@@ -189,7 +191,7 @@ class Evaluation:
     def average_precision(self) -> dict[str, float]:
         """By event, "overall", and "mean" over the events of which there are failures."""
         by_name = {name: scores.average_precision for name, scores in self.scores.items()}
-        defined = [by_name[event] for event in EVENTS if not math.isnan(by_name[event])]
+        defined = [value for name, value in by_name.items() if name != OVERALL and not math.isnan(value)]
         return {**by_name, "mean": _ratio(sum(defined), len(defined))}
 
     @property
@@ -208,14 +210,15 @@ def confusion(probabilities: np.ndarray, failed: np.ndarray, threshold: float = 
 
 
 def confusions(
-    probabilities: Float[np.ndarray, "s 3"],
-    failed: Bool[np.ndarray, "s 3"],
+    probabilities: Float[np.ndarray, "s k"],
+    failed: Bool[np.ndarray, "s k"],
     threshold: float | Sequence[float] = THRESHOLD,
+    events: Sequence[str] = EVENTS,
 ) -> dict[str, Confusion]:
-    """The confusion of each event, and overall; `threshold` is one for all or one an event."""
-    thresholds = np.broadcast_to(threshold, len(EVENTS)).tolist()
+    """The confusion of each event, and overall; `threshold` is one for all or one an event, `events` their names."""
+    thresholds = np.broadcast_to(threshold, len(events)).tolist()
     return with_overall(
-        {name: confusion(probabilities[:, e], failed[:, e], thresholds[e]) for e, name in enumerate(EVENTS)}
+        {name: confusion(probabilities[:, e], failed[:, e], thresholds[e]) for e, name in enumerate(events)}
     )
 
 
@@ -250,41 +253,43 @@ def calibration(probabilities: np.ndarray, failed: np.ndarray, bins: int = 10) -
 
 
 def evaluate(
-    probabilities: Float[np.ndarray, "s 3"],
-    failed: Bool[np.ndarray, "s 3"],
+    probabilities: Float[np.ndarray, "s k"],
+    failed: Bool[np.ndarray, "s k"],
     groups: Sequence[str] | np.ndarray | None = None,
     *,
+    events: Sequence[str] = EVENTS,
     recalls: Sequence[float] = (0.9, 0.99),
     paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
     threshold: float = THRESHOLD,
 ) -> Evaluation:
-    """Everything about predicted probabilities [s, 3] of samples whose failures [s, 3] are known.
+    """Everything about predicted probabilities [s, k] of samples whose failures [s, k] are known.
 
     groups:  [s] the group of each sample, such as its style
+    events:  names of the k events
     recalls: those to find thresholds for, beside the recalls of `paper`
     Raises InputError when shapes differ, there is no sample, or a probability is not from 0 to 1.
     """
-    probabilities, failed = _checked(probabilities, failed)
-    columns = {name: (probabilities[:, e], failed[:, e]) for e, name in enumerate(EVENTS)}
+    probabilities, failed = _checked(probabilities, failed, len(events))
+    columns = {name: (probabilities[:, e], failed[:, e]) for e, name in enumerate(events)}
     columns[OVERALL] = (probabilities, failed)
     curves = {name: precision_recall_curve(*column) for name, column in columns.items()}
-    counts = confusions(probabilities, failed, threshold)
-    wanted = {name: {*recalls, *_recall_of(paper, name)} for name in NAMES}
+    counts = confusions(probabilities, failed, threshold, events)
+    wanted = {name: {*recalls, *_recall_of(paper, name)} for name in columns}
     return Evaluation(
         samples=len(failed),
         any_failure=float(failed.any(axis=1).mean()),
         threshold=threshold,
-        scores={name: Scores(counts[name], curves[name].average_precision) for name in NAMES},
+        scores={name: Scores(counts[name], curves[name].average_precision) for name in columns},
         curves={name: curve.thinned() for name, curve in curves.items()},
         points={name: _points(*column, curves[name], wanted[name]) for name, column in columns.items()},
         calibration={name: calibration(*column) for name, column in columns.items()},
-        groups={} if groups is None else _of_groups(probabilities, failed, groups, threshold),
+        groups={} if groups is None else _of_groups(columns, groups, threshold),
     )
 
 
 def _recall_of(paper: Mapping[str, Confusion] | None, name: str) -> set[float]:
     """The recall that the paper prints, if any."""
-    return {round(paper[name].recall, 3)} if paper and paper[name].recall > 0 else set()
+    return {round(paper[name].recall, 3)} if paper and name in paper and paper[name].recall > 0 else set()
 
 
 def _points(probabilities, failed, curve: Curve, recalls: Iterable[float]) -> tuple[OperatingPoint, ...]:
@@ -292,10 +297,13 @@ def _points(probabilities, failed, curve: Curve, recalls: Iterable[float]) -> tu
     return tuple(OperatingPoint(*point, confusion(probabilities, failed, point[1])) for point in points)
 
 
-def _of_groups(probabilities, failed, groups, threshold: float) -> dict[str, dict[str, Scores]]:
-    members: np.ndarray = np.asarray(groups)
-    require(members.shape == failed.shape[:1], "groups", members.shape, f"one name for each of {len(failed)} samples")
-    return {str(name): _scores(probabilities[of], failed[of], threshold) for name, of in _masks(members)}
+def _of_groups(columns: Columns, groups, threshold: float) -> dict[str, dict[str, Scores]]:
+    members, samples = np.asarray(groups), len(columns[OVERALL][1])
+    require(members.shape == (samples,), "groups", members.shape, f"one name for each of {samples} samples")
+    return {
+        str(group): {name: _scores(p[of], failed[of], threshold) for name, (p, failed) in columns.items()}
+        for group, of in _masks(members)
+    }
 
 
 def _masks(members: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
@@ -308,17 +316,14 @@ def _masks(members: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
         yield name, of
 
 
-def _scores(probabilities: np.ndarray, failed: np.ndarray, threshold: float) -> dict[str, Scores]:
-    precisions = [average_precision(probabilities[:, e], failed[:, e]) for e in range(len(EVENTS))]
-    precisions.append(average_precision(probabilities, failed))
-    counts = confusions(probabilities, failed, threshold)
-    return {name: Scores(counts[name], precision) for name, precision in zip(NAMES, precisions, strict=True)}
+def _scores(probabilities: np.ndarray, failed: np.ndarray, threshold: float) -> Scores:
+    return Scores(confusion(probabilities, failed, threshold), average_precision(probabilities, failed))
 
 
-def _checked(probabilities, failed) -> tuple[np.ndarray, np.ndarray]:
+def _checked(probabilities, failed, events: int) -> tuple[np.ndarray, np.ndarray]:
     probabilities, failed = np.asarray(probabilities), np.asarray(failed)
-    allowed = f"[s, {len(EVENTS)}], at least one sample"
-    require(failed.ndim == 2 and failed.shape[1] == len(EVENTS) and len(failed) > 0, "failed", failed.shape, allowed)
+    allowed = f"[s, {events}], at least one sample"
+    require(failed.ndim == 2 and failed.shape[1] == events and len(failed) > 0, "failed", failed.shape, allowed)
     require(failed.dtype == bool, "failed", failed.dtype, "of dtype bool")
     require(probabilities.shape == failed.shape, "probabilities", probabilities.shape, f"{failed.shape}, as failed is")
     probabilities = probabilities.astype(np.result_type(probabilities, np.float32), copy=False)

@@ -3,19 +3,23 @@
 Functions return a matplotlib Figure; `plots.save` writes it.
 """
 
+import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle, pairwise
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from travjax.config import one_line
-from travjax.evaluation.metrics import NAMES, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
+from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
 from travjax.evaluation.transfer_scores import Results
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 
-COLOURS = dict(zip(NAMES, ("tab:blue", "tab:orange", "tab:purple", "black"), strict=True))
+COLOURS = ("tab:blue", "tab:orange", "tab:purple", "tab:green", "tab:red", "navy", "teal")
+"""Of a robot's events, in their order."""
+
 BASELINES = ("tab:brown", "tab:olive", "tab:cyan", "tab:pink", "tab:gray")
 
 
@@ -28,16 +32,19 @@ def precision_recall_figure(
 
     Marked are the threshold of the evaluation and where the paper stands. baselines: other predictors by name.
     """
-    figure = Figure(figsize=(13.5, 9), layout="constrained")
-    axes = figure.subplots(2, 2, sharex=True, sharey=True)
-    for ax, name in zip(axes.flat, NAMES, strict=True):
+    rows, colours = math.ceil(len(evaluation.scores) / 2), _colours_of(evaluation.scores)
+    figure = Figure(figsize=(13.5, 4.5 * rows), layout="constrained")
+    axes = figure.subplots(rows, 2, sharex=True, sharey=True)
+    for ax in axes.flat[len(colours) :]:
+        ax.set_visible(False)
+    for ax, (name, own) in zip(axes.flat, colours.items(), strict=False):
         _draw_equal_f1(ax)
         for colour, (other, one) in zip(cycle(BASELINES), (baselines or {}).items(), strict=False):
             _draw_curve(ax, one.curves[name], one.scores[name].average_precision, other, color=colour, linewidth=1.2)
         scores = evaluation.scores[name]
-        _draw_curve(ax, evaluation.curves[name], scores.average_precision, "network", color=COLOURS[name], linewidth=2)
-        _draw_point(ax, scores.confusion, "o", COLOURS[name], f"network at {evaluation.threshold:g}")
-        if paper:
+        _draw_curve(ax, evaluation.curves[name], scores.average_precision, "network", color=own, linewidth=2)
+        _draw_point(ax, scores.confusion, "o", own, f"network at {evaluation.threshold:g}")
+        if paper and name in paper:
             _draw_point(ax, paper[name], "*", "red", "paper")
         ax.set_title(f"{name}: {scores.confusion.failures:.2%} of {scores.confusion.samples:,} fail", fontsize=10)
         ax.set(xlim=(0, 1.01), ylim=(0, 1.01))
@@ -47,6 +54,12 @@ def precision_recall_figure(
     for ax in axes[:, 0]:
         ax.set_ylabel("precision")
     return figure
+
+
+def _colours_of(names: Iterable[str]) -> dict[str, str]:
+    """A colour for each event, and black for "overall"."""
+    colours = iter(COLOURS)
+    return {name: "black" if name == OVERALL else next(colours) for name in names}
 
 
 def _draw_equal_f1(ax) -> None:
@@ -77,18 +90,17 @@ def _draw_point(ax, counts: Confusion, marker: str, colour: str, label: str) -> 
 
 def reliability_figure(evaluation: Evaluation) -> Figure:
     """Observed share of failures against predicted probability, of each event and overall; samples a bin below."""
-    figure = Figure(figsize=(14, 5.2), layout="constrained")
-    axes = figure.subplots(2, len(NAMES), sharex=True, sharey="row", height_ratios=(3, 1))
-    for (upper, lower), name in zip(axes.T, NAMES, strict=True):
+    colours = _colours_of(evaluation.scores)
+    figure = Figure(figsize=(3.5 * len(colours), 5.2), layout="constrained")
+    axes = figure.subplots(2, len(colours), sharex=True, sharey="row", height_ratios=(3, 1))
+    for (upper, lower), (name, colour) in zip(axes.T, colours.items(), strict=True):
         bins = evaluation.calibration[name]
         upper.plot([0, 1], [0, 1], color="0.6", linewidth=1, linestyle="--")
         filled = bins.count > 0
-        upper.plot(
-            bins.probability[filled], bins.observed[filled], "o-", color=COLOURS[name], markersize=4, clip_on=False
-        )
+        upper.plot(bins.probability[filled], bins.observed[filled], "o-", color=colour, markersize=4, clip_on=False)
         upper.set_title(f"{name}, calibration error {bins.error:.4f}", fontsize=10)
         upper.set(xlim=(0, 1), ylim=(0, 1))
-        lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=COLOURS[name], alpha=0.7)
+        lower.bar(bins.edges[:-1], bins.count, np.diff(bins.edges), align="edge", color=colour, alpha=0.7)
         lower.set_yscale("log")
         lower.set_xlabel("predicted probability")
         for ax in (upper, lower):
@@ -99,11 +111,12 @@ def reliability_figure(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def training_figure(rows: Sequence[Mapping]) -> Figure:
+def training_figure(rows: Sequence[Mapping], events: Sequence[str] = EVENTS) -> Figure:
     """Losses, average precision, F1 and learning rate against the training step.
 
     rows: as read from metrics.jsonl, in order. Keys `step`, `phase`, `loss`, `validation_loss`, `learning_rate`, and
     `average_precision` and `f1` by event; a row may lack any but `step`, and what is no number is not drawn.
+    events: their names
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
@@ -111,7 +124,7 @@ def training_figure(rows: Sequence[Mapping]) -> Figure:
     _draw_series(loss, *_series(rows, "loss"), label="training", color="tab:blue", linewidth=1)
     _draw_series(loss, *_series(rows, "validation_loss"), label="validation", color="tab:red", marker="o")
     _draw_series(rate, *_series(rows, "learning_rate"), color="tab:green", drawstyle="steps-post")
-    for name, colour in COLOURS.items():
+    for name, colour in _colours_of([*events, OVERALL]).items():
         for ax, key in ((precision, "average_precision"), (f1, "f1")):
             _draw_series(ax, *_series(rows, key, name), label=name, color=colour, marker="o")
     titles = ("loss", "average precision, validation", "learning rate", f"F1 at {THRESHOLD:g}, validation")

@@ -7,12 +7,13 @@ import numpy as np
 from tabulate import tabulate
 
 from travjax.config import QUOTED, one_line
-from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
-from travjax.simulation.traverse import EVENTS
+from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
+from travjax.simulation.events import EVENTS
 
-PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, "any failure": 0.096}
+ANY = "any failure"
+
+PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, ANY: 0.096}
 """Shares of the paper's synthetic test trajectories that fail (SPEC section 10); its robot is not published in full."""
-
 
 AT_ONCE = 1024
 """Maps whose flags are looked at together: they may lie on the disk."""
@@ -23,11 +24,15 @@ TOLERANCE = 0.1
 
 
 def shares_table(
-    groups: Sequence[str] | np.ndarray, failed: np.ndarray, known: np.ndarray, as_in_paper: bool = True
+    groups: Sequence[str] | np.ndarray,
+    failed: np.ndarray,
+    known: np.ndarray,
+    as_in_paper: bool = True,
+    events: Sequence[str] = EVENTS,
 ) -> str:
     """Shares of known trajectories that fail, for each group of maps and overall, the paper's below if they compare.
 
-    groups: [n] name of each map's group; failed: [n, t, 3]; known: [n, t]
+    groups: [n] name of each map's group; failed: [n, t, k]; known: [n, t]; events: names of the k events
     """
     members: np.ndarray = np.asarray(groups)
     names = list(dict.fromkeys(groups))
@@ -37,22 +42,23 @@ def shares_table(
     if len(names) > 1:
         rows.append(_shares("overall", counts, known.shape[1]))
     if as_in_paper:
-        rows.append(["paper's test set", None, *(f"{share:.2%}" for share in PAPER_SHARES.values()), None, None])
-    headers = ["", "maps", *PAPER_SHARES, "maps with none", "known"]
+        shares = [f"{PAPER_SHARES[name]:.2%}" if name in PAPER_SHARES else None for name in (*events, ANY)]
+        rows.append(["paper's test set", None, *shares, None, None])
+    headers = ["", "maps", *events, ANY, "maps with none", "known"]
     return _table(rows, headers)
 
 
 def _failures(failed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Of each map the known trajectories, those of them that fail by each event, and by any: [n, 5]."""
+    """Of each map the known trajectories, those of them that fail by each event, and by any: [n, k + 2]."""
     fails = np.asarray(failed) & np.asarray(known)[..., None]
     return np.column_stack([known.sum(axis=1), fails.sum(axis=1), fails.any(axis=-1).sum(axis=1)])
 
 
 def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
-    """The row of some maps, from what `_failures` says of them: [n, 5]."""
+    """The row of some maps, from what `_failures` says of them: [n, k + 2]."""
     known, *fails = counts.sum(axis=0)
     if not known:
-        return [name, len(counts), *["-"] * 5, "0.0%"]
+        return [name, len(counts), *["-"] * counts.shape[1], "0.0%"]
     none = counts[counts[:, 0] > 0, -1] == 0
     return [
         name,
@@ -84,7 +90,7 @@ def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None 
         precision, error = scores.average_precision, evaluation.calibration[name].error
         rows.append([name, *_figures(scores.confusion), _share(precision), _share(error), *_counts(scores.confusion)])
         notes.append(_why_undefined(name, scores.confusion))
-        if paper:
+        if paper and name in paper:
             rows.append(["  paper", *_figures(paper[name]), "", "", *_counts(paper[name])])
             notes.append(_why_undefined(f"{name} in the paper", paper[name]))
     headers = ["", "accuracy", "recall", "precision", "F1", "failures", "AP", "ECE", "TN", "FP", "FN", "TP"]
@@ -99,7 +105,7 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
             found = point.confusion
             threshold, flagged = f"{point.threshold:.4g}", f"{(found.fp + found.tp) / found.samples:.2%}"
             figures = [threshold, _share(found.recall), _share(found.precision), _share(found.f1), flagged]
-            beside = _share(paper[name].precision) if paper and _is_of(paper[name], point) else ""
+            beside = _share(paper[name].precision) if paper and name in paper and _is_of(paper[name], point) else ""
             rows.append([name, f"{point.wanted:.3f}", *(["-"] * 5 if math.isnan(point.threshold) else figures), beside])
         notes.append(_why_undefined(name, points[0].confusion))
     headers = ["", "wanted recall", "threshold", "recall", "precision", "F1", "predicted to fail", "paper's precision"]
@@ -126,19 +132,19 @@ def calibration_line(evaluation: Evaluation) -> str:
 def groups_table(evaluation: Evaluation) -> str:
     """For each group its samples and, of each event, the share that fails, F1 and average precision."""
     rows = []
-    undefined: dict[str, list[str]] = {event: [] for event in EVENTS}
+    undefined: dict[str, list[str]] = {name: [] for name in evaluation.scores if name != OVERALL}
     for group, scores in [*evaluation.groups.items(), ("all", evaluation.scores)]:
         group = one_line(group, QUOTED)
-        events = [scores[event] for event in EVENTS]
-        failures = [f"{one.confusion.failures:.2%}" for one in events]
-        f1 = [_share(one.confusion.f1) for one in (*events, scores["overall"])]
-        precisions = [_share(one.average_precision) for one in (*events, scores["overall"])]
-        for event, one in zip(EVENTS, events, strict=True):
-            undefined[event] += [] if one.confusion.failures else [group]
-        rows.append([group, f"{events[0].confusion.samples:,}", *failures, *f1, *precisions])
+        failing = {event: scores[event].confusion.failures for event in undefined}
+        f1 = [_share(one.confusion.f1) for one in scores.values()]
+        precisions = [_share(one.average_precision) for one in scores.values()]
+        for event, share in failing.items():
+            undefined[event] += [] if share else [group]
+        samples = next(iter(scores.values())).confusion.samples
+        rows.append([group, f"{samples:,}", *(f"{share:.2%}" for share in failing.values()), *f1, *precisions])
     per_event = [
-        *(f"{event} fails" for event in EVENTS),
-        *(f"{what} {name}" for what in ("F1", "AP") for name in NAMES),
+        *(f"{event} fails" for event in undefined),
+        *(f"{what} {name}" for what in ("F1", "AP") for name in evaluation.scores),
     ]
     headers = [title.replace(" ", "\n") for title in ("", "samples", *per_event)]
     notes = [f"{event}: no sample fails in {', '.join(names)}" for event, names in undefined.items() if names]
@@ -147,7 +153,7 @@ def groups_table(evaluation: Evaluation) -> str:
 
 def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
     """Average precision of named predictors by event, overall and their mean, from `Evaluation.average_precision`."""
-    columns = (*NAMES, "mean")
+    columns = list(next(iter(rows.values())))
     undefined = [name for name in columns if any(math.isnan(values[name]) for values in rows.values())]
     cells = [[predictor, *(_share(values[name]) for name in columns)] for predictor, values in rows.items()]
     notes = [f"{name}: no sample fails, so average precision is undefined" for name in undefined]

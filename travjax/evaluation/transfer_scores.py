@@ -49,11 +49,12 @@ class Epoch:
         allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
         require(_is_scored(row), "row of metrics.jsonl", row, allowed)
         sites = {
-            site: {name: Confusion(*(scores[name]["confusion"][count] for count in COUNTS)) for name in NAMES}
+            site: {name: Confusion(*(one["confusion"][count] for count in COUNTS)) for name, one in scores.items()}
             for site, scores in row["watched"].items()
         }
         if len(sites) > 1:
-            sites[ALL] = {name: sum((one[name] for one in sites.values()), Confusion(0, 0, 0, 0)) for name in NAMES}
+            first = next(iter(sites.values()))
+            sites[ALL] = {name: sum((one[name] for one in sites.values()), Confusion(0, 0, 0, 0)) for name in first}
         precision = row.get("average_precision")
         return Epoch(row["epoch"], precision and precision[OVERALL], sites)
 
@@ -64,8 +65,9 @@ def _is_scored(row: Mapping) -> bool:
     sites, precision = row.get("watched"), row.get("average_precision")
     if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
         return False
+    names = dict.fromkeys((*NAMES, *(name for site in sites.values() if isinstance(site, Mapping) for name in site)))
     counts = [
-        at(at(at(site, name), "confusion"), count) for site in sites.values() for name in NAMES for count in COUNTS
+        at(at(at(site, name), "confusion"), count) for site in sites.values() for name in names for count in COUNTS
     ]
     overall = at(precision, OVERALL) if isinstance(precision, Mapping) and OVERALL in precision else "none"
     validated = precision is None or type(overall) in (int, float, type(None))
@@ -118,6 +120,11 @@ class Results:
     def sites(self) -> list[str]:
         """The held-out sites, and ALL if they are several."""
         return list(self._some)
+
+    @property
+    def events(self) -> list[str]:
+        """The robot's events, and "overall"."""
+        return list(next(iter(self._some.values())))
 
     def always(self, site: str, event: str = OVERALL) -> Confusion:
         """The predictor that says "fails" of every trajectory."""
@@ -197,13 +204,13 @@ def events_table(results: Results, arm: str) -> str:
     for site in results.sites:
         states = {"untrained": results.first(arm), "best epoch": results.best(arm, site)}
         states["validation's epoch"] = results.chosen(arm)
-        for event in NAMES:
+        for event in results.events:
             always = results.always(site, event)
             for state, epochs in states.items():
                 counts = [epoch.held_out[site][event] for epoch in epochs]
                 first = state == "untrained"
                 place = {
-                    "site": site if first and event == NAMES[0] else "",
+                    "site": site if first and event == results.events[0] else "",
                     "event": event if first else "",
                     "failures": f"{always.failures:.2%}" if first else "",
                     "always": mean_and_spread([always.f1]) if first else "",
@@ -240,7 +247,7 @@ def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
     none = [
         f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
         for site in results.sites
-        for event in NAMES
+        for event in results.events
         if not results.always(site, event).tp
     ]
     dashes = any(row.get(name) == "-" for row in rows for name in ("precision", "chosen_precision"))
@@ -255,5 +262,5 @@ def results_json(results: Results) -> dict:
         return {"best_epoch": best, "validation_epoch": one.chosen.number, "epochs": json_ready(one.epochs)}
 
     arms = {arm: {str(seed): run(one) for seed, one in seeds.items()} for arm, seeds in results.arms.items()}
-    always = {site: {event: results.always(site, event) for event in NAMES} for site in results.sites}
+    always = {site: {event: results.always(site, event) for event in results.events} for site in results.sites}
     return {"arms": arms, "always_fails": json_ready(always)}

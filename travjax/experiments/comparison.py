@@ -7,7 +7,6 @@ under experiments/comparison.
 
 import argparse
 import json
-import math
 import statistics
 import time
 from collections.abc import Mapping, Sequence
@@ -43,7 +42,6 @@ from travjax.files import find_data, find_preset, output_folder, save_text, user
 from travjax.models.hazard_field import LARGE_MARGIN
 from travjax.resnet.network import ResNetConfig
 from travjax.runs.predictor import Predictor
-from travjax.simulation.traverse import EVENTS
 
 SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
 
@@ -229,10 +227,8 @@ def _on_synthetic_ground(
     noisy = [{"method": method} | {name: shown(value) for name, value in of.items()} for method, of in f1.items()]
     noisy.append({"method": "the best filter"} | {name: one["filter"] for name, one in results.items()})
     errors = clean["margin_errors"]
-    margins = (
-        f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: step "
-        f"{errors['step']:.4f} m, obstacle {errors['obstacle']:.4f} m, tilt {math.degrees(errors['tilt']):.2f} degrees."
-    )
+    each = ", ".join(f"{event.name} {event.shown(errors[event.name])}" for event in field.run.robot.events)
+    margins = f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: {each}."
     headline = (
         f"{field.run.robot.name}, {arguments.maps} test maps and {arguments.validation_maps} "
         f"validation maps that no preset trains on, {len(field.run.actions)} trajectories each, seed {arguments.seed}; "
@@ -240,7 +236,7 @@ def _on_synthetic_ground(
     )
     network = clean["methods"].get(NETWORK)
     if network:
-        drawn = network["confusion"][OVERALL].samples // len(EVENTS)
+        drawn = network["confusion"][OVERALL].samples // len(field.run.robot.events)
         headline += f" The {NETWORK}'s scores are of {drawn:,} random trajectories, the others' of all."
     lines = ["\t".join(columns.values()), *("\t".join(str(row[key]) for key in columns) for row in noisy)]
     save_text(out / "f1.tsv", "\n".join(lines) + "\n")

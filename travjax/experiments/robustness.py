@@ -1,9 +1,9 @@
 """Simulators and estimators on the same maps, clean and as sensors see them; labels are always those of the clean map.
 
-A method turns maps [n, rows, cols] into scores of failure [n, t, 3], of which 0.5 and more says "fails".
+A method turns maps [n, rows, cols] into scores of failure [n, t, k], of which 0.5 and more says "fails".
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,15 +17,16 @@ from travjax.data.provenance import SitesConfig
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.estimators.inference import Placed, probabilities
-from travjax.evaluation.metrics import NAMES, OVERALL, Confusion, average_precision, confusions
+from travjax.evaluation.metrics import OVERALL, Confusion, average_precision, confusions
 from travjax.runs.predictor import Predictor
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS, simulate
+from travjax.simulation.traverse import simulate
 
 Maps = Float[np.ndarray, "n rows cols"]
-Fails = Float[np.ndarray, "*k 3"]
+Fails = Float[np.ndarray, "*m k"]
 Progress = Callable[[int], object]
 
 NOISES = (0.01, 0.02, 0.05)
@@ -73,14 +74,14 @@ class BenchmarkMaps:
 
     heights: [n, rows, cols] metres, none unknown: what was unknown has the height of the nearest known node
     known:   [n, t] whether a trajectory touches known ground alone; the others count in no score
-    failed:  [n, t, 3]
-    margins: [n, t, 3] metres, metres, radians, NaN where unknown
+    failed:  [n, t, k] by the robot's k events
+    margins: [n, t, k] metres or radians, NaN where unknown
     """
 
     heights: Maps
     known: Bool[np.ndarray, "n t"]
-    failed: Bool[np.ndarray, "n t 3"]
-    margins: Float[np.ndarray, "n t 3"]
+    failed: Bool[np.ndarray, "n t k"]
+    margins: Float[np.ndarray, "n t k"]
     robot: Robot
     actions: ActionSpace
     grid: Grid
@@ -108,7 +109,7 @@ class BenchmarkMaps:
 
     @staticmethod
     def _from_batch(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
-        margins = np.stack([maps[event] for event in EVENTS], axis=-1)
+        margins = np.stack([maps[event] for event in robot.event_names], axis=-1)
         heights = sensor_noise.filled(maps["heights"])
         return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
 
@@ -131,8 +132,8 @@ class BenchmarkMaps:
         return max(scores, key=lambda name: scores[name])
 
     def scores(self, fails: Fails, threshold: float = 0.5) -> dict[str, Confusion]:
-        """The confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, 3]."""
-        return scores(fails[self.known], self.failed[self.known], threshold)
+        """The confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, k]."""
+        return scores(fails[self.known], self.failed[self.known], threshold, self.robot.event_names)
 
 
 def of_sites(
@@ -159,25 +160,29 @@ def of_sites(
     return grounds
 
 
-def by_margins(margins: Float[np.ndarray, "n t 3"], robot: Robot) -> Fails:
+def by_margins(margins: Float[np.ndarray, "n t k"], robot: Robot) -> Fails:
     """Scores of regressed margins, which are 0.5 at the robot's limits."""
     return np.clip(margins / np.asarray(robot.limits, np.float32) / 2, 0, 1)
 
 
 def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
-    """Probabilities of an estimator for samples [k] of maps: [k, 3]; on_progress: is told of samples."""
+    """Probabilities of an estimator for samples [m] of maps: [m, k]; on_progress: is told of samples."""
     devices = Devices.all()
     placed = Placed.from_network(predictor.network, devices.replicate(predictor.run.source(maps)), devices)
     return probabilities(predictor.run.kind.logits(placed, samples, 64 * devices.mesh.size, on_progress))
 
 
-def scores(fails: Fails, failed: Bool[np.ndarray, "*k 3"], threshold: float = 0.5) -> dict[str, Confusion]:
-    """The confusion of each event, and of all pooled."""
-    return confusions(fails.reshape(-1, len(EVENTS)), failed.reshape(-1, len(EVENTS)), threshold)
+def scores(
+    fails: Fails, failed: Bool[np.ndarray, "*m k"], threshold: float = 0.5, events: Sequence[str] = EVENTS
+) -> dict[str, Confusion]:
+    """The confusion of each event, given by name, and of all pooled."""
+    return confusions(fails.reshape(-1, len(events)), failed.reshape(-1, len(events)), threshold, events)
 
 
-def average_precisions(fails: Fails, failed: Bool[np.ndarray, "*k 3"]) -> dict[str, float]:
-    """Of each event, and of all pooled."""
-    columns = [(fails[..., event], failed[..., event]) for event in range(len(EVENTS))]
-    pairs = zip(NAMES, [*columns, (fails, failed)], strict=True)
-    return {name: average_precision(one.ravel(), true.ravel()) for name, (one, true) in pairs}
+def average_precisions(
+    fails: Fails, failed: Bool[np.ndarray, "*m k"], events: Sequence[str] = EVENTS
+) -> dict[str, float]:
+    """Of each event, given by name, and of all pooled."""
+    columns = {name: (fails[..., event], failed[..., event]) for event, name in enumerate(events)}
+    pairs = columns | {OVERALL: (fails, failed)}
+    return {name: average_precision(one.ravel(), true.ravel()) for name, (one, true) in pairs.items()}

@@ -1,14 +1,14 @@
 """Scores of the comparison: the names of the methods, what each reaches on a ground, and the tables of it."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from travjax import progress
 from travjax.data.sampling import Samples
 from travjax.evaluation import metrics
-from travjax.evaluation.metrics import NAMES, OVERALL, Confusion
+from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.evaluation.tables import rows_table
 from travjax.experiments.robustness import (
     CLEAN,
@@ -23,7 +23,6 @@ from travjax.experiments.robustness import (
 )
 from travjax.models.hazard_field import LARGE_MARGIN
 from travjax.runs.predictor import Predicted, Predictor
-from travjax.simulation.traverse import EVENTS
 
 SIMULATOR, FILTERED = "simulator", "simulator, best filter"
 HAZARD, MARGINS, NETWORK = "hazard field", "hazard field, margins", "ResNet50"
@@ -64,7 +63,7 @@ def compare(
 ) -> dict:
     """For every corruption: the filter chosen for it, and for every method its confusions and average precisions."""
     results: dict[str, dict] = {}
-    drawn = _drawn(test, samples, seed)
+    drawn, events = _drawn(test, samples, seed), test.robot.event_names
     methods = 3 + (resnet is not None)
     with progress.bar("corruptions", len(CORRUPTIONS) * methods, "method") as bar:
         for name in CORRUPTIONS:
@@ -80,7 +79,7 @@ def compare(
             if resnet:
                 found[NETWORK] = (of_samples(resnet, seen, drawn), test.failed[drawn])
                 bar.update()
-            by_method = {method: _scored(*pair) for method, pair in found.items()}
+            by_method = {method: _scored(*pair, events) for method, pair in found.items()}
             results[name] = {"filter": chosen[name], "methods": by_method}
             if name == CLEAN:
                 results[name] |= _on_clean_maps(test, validation, field, predicted)
@@ -100,20 +99,22 @@ def _drawn(test: BenchmarkMaps, samples: int, seed: int) -> Samples:
     return places // trajectories, places % trajectories
 
 
-def _scored(fails: np.ndarray, failed: np.ndarray) -> dict:
-    return {"confusion": scores(fails, failed), "average_precision": average_precisions(fails, failed)}
+def _scored(fails: np.ndarray, failed: np.ndarray, events: Sequence[str]) -> dict:
+    precisions = average_precisions(fails, failed, events)
+    return {"confusion": scores(fails, failed, events=events), "average_precision": precisions}
 
 
 def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predictor, predicted: Predicted) -> dict:
-    """The threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
+    """The threshold for RECALL, chosen on validation maps, and the errors of the margins."""
+    events = test.robot.event_names
     probability = field.predict(validation.heights).probability
     threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
     largest = LARGE_MARGIN * np.asarray(test.robot.limits)
     off = np.minimum(_margins(predicted.margins), largest) - np.minimum(test.margins, largest)
     return {
         "threshold": threshold,
-        "at_threshold": scores(predicted.probability, test.failed, threshold),
-        "margin_errors": dict(zip(EVENTS, np.abs(off).mean(axis=(0, 1)).tolist(), strict=True)),
+        "at_threshold": scores(predicted.probability, test.failed, threshold, events),
+        "margin_errors": dict(zip(events, np.abs(off).mean(axis=(0, 1)).tolist(), strict=True)),
     }
 
 
@@ -167,12 +168,11 @@ def quality_table(clean: dict) -> str:
     for method, scored in clean["methods"].items():
         if method == FILTERED:
             continue
-        for event in NAMES:
-            confusion, precision = scored["confusion"][event], scored["average_precision"][event]
-            rows.append(_quality(method if event == NAMES[0] else "", event, confusion, precision))
-    for event in NAMES:
-        name = f"{HAZARD} at {clean['threshold']:.3f}" if event == NAMES[0] else ""
-        rows.append(_quality(name, event, clean["at_threshold"][event], math.nan))
+        for number, (event, confusion) in enumerate(scored["confusion"].items()):
+            rows.append(_quality("" if number else method, event, confusion, scored["average_precision"][event]))
+    for number, (event, confusion) in enumerate(clean["at_threshold"].items()):
+        name = "" if number else f"{HAZARD} at {clean['threshold']:.3f}"
+        rows.append(_quality(name, event, confusion, math.nan))
     return rows_table(rows, QUALITY)
 
 

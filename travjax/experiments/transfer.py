@@ -245,7 +245,7 @@ def _maps_figure(transfer):
     for name, estimator in models.items():
         with progress.bar(f"maps for the figure, {name}", len(shown) * len(base.actions), "sample") as bar:
             predictions[name] = evaluator.whole_maps(estimator, shown, bar.update)
-    failed, known = map(np.asarray, unpacked(data.labels[shown]))
+    failed, known = map(np.asarray, unpacked(data.labels[shown], base.robot))
     places = data.provenance.origin[shown] if data.provenance else shown
     titles = [f"{config.shown}, SW {np.round(place, 1).tolist()}" for place in places]
     return map_figures.predicted_maps(

@@ -189,8 +189,9 @@ class Transfer:
         file = find_weights(preset.weights) if arm == IMAGENET else None
         weights = load_weights(file, preset.trunk) if file else None
         trunk_seed = self.config.seeds[0] if self.config.frozen else seed
-        made = create(preset.trunk, preset.heads, trunk_seed, weights)
-        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, rngs=nnx.Rngs(key_of(seed + 1))))
+        made, events = create(preset.trunk, preset.heads, trunk_seed, weights), self.base.robot.event_names
+        rngs = nnx.Rngs(key_of(seed + 1))
+        return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, events, rngs=rngs))
 
     def _features_file(self, arm: str) -> Path:
         """Names the file of an arm's features, for its other seeds and for a run that goes on."""

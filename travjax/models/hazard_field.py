@@ -20,7 +20,7 @@ from travjax.jax_flags import key_of, usual_flags
 from travjax.models.pose_stencil import STENCIL_NODES, Stencil
 from travjax.resnet.convolution import convolve
 from travjax.resnet.network import ConvNorm
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 RELIEF = 9
 """Nodes along the edge of the window whose mean is taken off the elevation for the first input channel."""
@@ -127,16 +127,16 @@ class UNet(nnx.Module):
 class PoseHead(nnx.Module):
     """The channels at a pose's stencil to its logits and margins."""
 
-    def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
-        inputs, hidden, outputs = (STENCIL_NODES + 1) * config.channels, config.hidden, 2 * len(EVENTS)
+    def __init__(self, config: FieldConfig, events: int, *, rngs: nnx.Rngs):
+        inputs, hidden, outputs = (STENCIL_NODES + 1) * config.channels, config.hidden, 2 * events
         self.first = nnx.Linear(inputs, hidden, use_bias=False, kernel_init=_he_normal, rngs=rngs)
         self.bias = nnx.Param(jnp.zeros(hidden, jnp.float32))
         self.second = nnx.Linear(hidden, hidden, kernel_init=_he_normal, rngs=rngs)
         self.hazard = nnx.Linear(hidden, outputs, rngs=rngs)
-        self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0], jnp.float32), len(EVENTS)))
+        self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0], jnp.float32), events))
 
-    def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b 6"]:
-        """Three logits, then three margins in units of the robot's limits.
+    def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b h"]:
+        """A logit of each event, then a margin of each in units of the robot's limits.
 
         The ground is seen relative to its mean over the stencil, and the mean beside it.
         """
@@ -156,13 +156,13 @@ class HazardField(nnx.Module):
 
     def __call__(
         self, elevation: Float[Array, "b rows cols"], stencil: Stencil, *, train: bool = False
-    ) -> tuple[Float[Array, "b t 3"], Float[Array, "b t 3"]]:
+    ) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
         """Logits and margins, the margins in units of the robot's limits, of the trajectories of a stencil."""
         arcs, poses, _ = stencil.nodes.shape
         hazard = self.at(self.trunk(elevation, train), stencil.nodes.reshape(arcs * poses, -1))
         return read_out(hazard.reshape(arcs, poses, *hazard.shape[1:]), stencil)
 
-    def at(self, channels: Float[Array, "b rows cols c"], nodes) -> Float[Array, "p b 6"]:
+    def at(self, channels: Float[Array, "b rows cols c"], nodes) -> Float[Array, "p b h"]:
         """The field at poses of stencils [p, s], from the channels at all nodes."""
         maps, rows, cols, count = channels.shape
         # Maps and channels side by side: a row is read for each node, and added to in the gradient, at full width.
@@ -171,11 +171,11 @@ class HazardField(nnx.Module):
         return self.heads(ground.reshape(*nodes.shape, maps, count))
 
 
-def read_out(hazard: Float[Array, "f p b 6"], stencil: Stencil) -> tuple[Float[Array, "b t 3"], Float[Array, "b t 3"]]:
+def read_out(hazard: Float[Array, "f p b h"], stencil: Stencil) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
     """Logits and margins of trajectories from those of their poses, in the order of a stencil's."""
     first, rest = hazard[:, : stencil.first_poses], hazard[:, stencil.first_poses :]
     second = rest.reshape(len(hazard), stencil.second_arcs, -1, *hazard.shape[2:])
-    events = len(EVENTS)
+    events = hazard.shape[-1] // 2
     smooth = lambda part, axis: jax.nn.logsumexp(part[..., :events], axis=axis)
     logits = jnp.logaddexp(smooth(first, 1)[:, None], smooth(second, 2))
     margins = jnp.maximum(first[..., events:].max(axis=1)[:, None], second[..., events:].max(axis=2))
@@ -184,10 +184,10 @@ def read_out(hazard: Float[Array, "f p b 6"], stencil: Stencil) -> tuple[Float[A
 
 
 @usual_flags()
-def create(config: FieldConfig = FieldConfig(), seed: int = 0) -> HazardField:
-    """An estimator with random parameters."""
+def create(config: FieldConfig = FieldConfig(), seed: int = 0, events: int = len(EVENTS)) -> HazardField:
+    """An estimator of so many events with random parameters."""
     trunk, heads = (nnx.Rngs(key_of(number)) for number in (seed, seed + 1))
-    return HazardField(UNet(config, rngs=trunk), PoseHead(config, rngs=heads))
+    return HazardField(UNet(config, rngs=trunk), PoseHead(config, events, rngs=heads))
 
 
 def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:

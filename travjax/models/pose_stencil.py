@@ -28,9 +28,9 @@ Nodes = Int[np.ndarray, "*p s"]
 @partial(jax.tree_util.register_dataclass, data_fields=["nodes"], meta_fields=["first_poses", "second_arcs"])
 @dataclass(frozen=True)
 class Stencil:
-    """The stencils of all poses, first arc by first arc.
+    """The stencils of all poses, first arc by first arc; the letters in shapes are those of footprint.py.
 
-    nodes:       [F, P, s] int32 nodes (row * cols + col): of F first arcs their own poses, then those of each second
+    nodes:       [F, P, s] int32 nodes (row * cols + col): of first arcs their own poses, then those of each second
                  arc in turn, so that trajectories come in the order of the action space
     first_poses: poses of a first arc, the junction included
     second_arcs: second arcs after each first one

@@ -11,7 +11,7 @@ from travjax.config import require, require_number
 from travjax.jax_flags import key_of, usual_flags
 from travjax.resnet.imagenet_weights import Weights, apply_weights
 from travjax.resnet.network import ResNet, ResNetConfig
-from travjax.simulation.traverse import EVENTS
+from travjax.simulation.events import EVENTS
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,17 @@ class Head(nnx.Module):
 
 
 class Heads(nnx.Module):
-    """The heads of all events, on the trunk's features."""
+    """The heads of all events, on the trunk's features; each is an attribute by its event's name."""
 
-    def __init__(self, features: int, config: HeadsConfig, *, rngs: nnx.Rngs):
-        for event in EVENTS:
+    def __init__(self, features: int, config: HeadsConfig, events: tuple[str, ...] = EVENTS, *, rngs: nnx.Rngs):
+        self.events = events
+        for event in events:
             setattr(self, event, Head(features, config, rngs=rngs))
 
-    def __call__(self, features: Float[Array, "b f"], key: Key[Array, ""] | None = None) -> Float[Array, "b 3"]:
-        """Logits in the order of EVENTS; with a key, dropout leaves out units."""
-        keys = [None] * len(EVENTS) if key is None else list(jax.random.split(key, len(EVENTS)))
-        heads = [getattr(self, event) for event in EVENTS]
+    def __call__(self, features: Float[Array, "b f"], key: Key[Array, ""] | None = None) -> Float[Array, "b k"]:
+        """Logits in the order of the events; with a key, dropout leaves out units."""
+        heads = [getattr(self, event) for event in self.events]
+        keys = [None] * len(heads) if key is None else list(jax.random.split(key, len(heads)))
         return jnp.stack([head(features, key) for head, key in zip(heads, keys, strict=True)], axis=-1)
 
 
@@ -72,8 +73,8 @@ class Estimator(nnx.Module):
 
     def __call__(
         self, images: Float[Array, "b rows cols 3"], *, train: bool = False, key: Key[Array, ""] | None = None
-    ) -> Float[Array, "b 3"]:
-        """Logits in the order of EVENTS.
+    ) -> Float[Array, "b k"]:
+        """Logits in the order of the events.
 
         train: batch statistics in the trunk, and the running ones move; key: for dropout, none without it
         """
@@ -87,8 +88,9 @@ def create(
     heads: HeadsConfig = HeadsConfig(),
     seed: int = 0,
     weights: Weights | None = None,
+    events: tuple[str, ...] = EVENTS,
 ) -> Estimator:
-    """An estimator with random parameters, or with a trunk of `weights`.
+    """An estimator of events, given by name, with random parameters, or with a trunk of `weights`.
 
     Raises InputError when the weights are those of another trunk.
     """
@@ -98,4 +100,4 @@ def create(
     else:
         body = nnx.eval_shape(make)  # random numbers for a whole trunk take ten seconds to compile
         apply_weights(body, weights)
-    return Estimator(body, Heads(trunk.features, heads, rngs=nnx.Rngs(key_of(seed + 1))))
+    return Estimator(body, Heads(trunk.features, heads, events, rngs=nnx.Rngs(key_of(seed + 1))))

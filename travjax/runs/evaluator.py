@@ -62,13 +62,13 @@ class Evaluator:
         return samples
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, 3] bool."""
-        return np.asarray(unpacked(self.dataset.labels[samples])[0])
+        """Failures of samples: [k, events] bool."""
+        return np.asarray(unpacked(self.dataset.labels[samples], self.run.robot)[0])
 
     def probabilities(
         self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> np.ndarray:
-        """Of samples: [k, 3]."""
+        """Returns the probabilities of samples: [k, events]."""
         placed = Placed.from_network(estimator, self.source, self.devices)
         size = self.run.preset.training.batch_size
         return probabilities(self.run.kind.logits(placed, samples, size, on_progress))
@@ -76,7 +76,7 @@ class Evaluator:
     def margins(
         self, network: Network, samples: Samples, on_progress: Progress = lambda count: None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns predicted and true margins of samples, [k, 3] each, in units of the robot's limits.
+        """Returns predicted and true margins of samples, [k, events] each, in units of the robot's limits.
 
         For estimators that have margins. Both are cut off at the kind's largest margin. on_progress: is told of maps
         Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
@@ -98,7 +98,7 @@ class Evaluator:
         data = self.dataset
         test = data.maps_of("test")
         test = test if group is None else test[data.group[test] == group]
-        failed, known = map(np.asarray, unpacked(data.labels[test]))
+        failed, known = map(np.asarray, unpacked(data.labels[test], self.run.robot))
         return test[map_batches.samples({"failed": failed, "known": known, "group": data.group[test]}, count)]
 
     def whole_maps(
@@ -121,7 +121,7 @@ class Evaluator:
         return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)
 
     def regression(self, samples: Samples) -> np.ndarray:
-        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, 3]."""
+        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, events]."""
         config, run, heights = self.run.preset.training, self.run, self.dataset.heights
         maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.each)]
         known = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
@@ -135,6 +135,13 @@ class Evaluator:
         return metrics.PAPER_SYNTHETIC if compares else None
 
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
-        """All figures of predicted probabilities [k, 3], by style or site as well."""
+        """All figures of predicted probabilities [k, events], by style or site as well."""
         groups = self.dataset.group[samples[0]]
-        return metrics.evaluate(probability, self.failed(samples), groups, recalls=recalls, paper=self.paper)
+        return metrics.evaluate(
+            probability,
+            self.failed(samples),
+            groups,
+            events=self.run.robot.event_names,
+            recalls=recalls,
+            paper=self.paper,
+        )

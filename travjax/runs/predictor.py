@@ -29,12 +29,12 @@ DEFAULT = "field_seekur_jr"
 class Predicted:
     """What an estimator says of the trajectories of maps.
 
-    probability: [n, t, 3] of step, obstacle and tilt failures
-    margins:     [n, t, 3] metres, metres, radians; None of an estimator that has none
+    probability: [n, t, k] of failures by the robot's events: step, obstacle and tilt unless it has more
+    margins:     [n, t, k] metres or radians; None of an estimator that has none
     """
 
-    probability: Float[np.ndarray, "*n t 3"]
-    margins: Float[np.ndarray, "*n t 3"] | None
+    probability: Float[np.ndarray, "*n t k"]
+    margins: Float[np.ndarray, "*n t k"] | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -100,19 +100,20 @@ class Predictor:
         return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
 
     def _outputs(self, maps: np.ndarray, on_progress: Progress) -> tuple[np.ndarray, np.ndarray | None]:
-        """Returns logits and margins of the trajectories of maps: [n, t, 3] each, no margins where there are none."""
+        """Returns logits and margins of the trajectories of maps: [n, t, k] each, no margins where there are none."""
         run, devices = self.run, Devices.all()
         placed = Placed.from_network(self.network, devices.replicate(run.source(maps)), devices)
         logits, margins = run.kind.of_maps(placed, np.arange(len(maps)), len(run.actions), on_progress)
         return logits, None if margins is None else margins * np.asarray(run.robot.limits, np.float32)
 
 
-def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t 3"]:
+def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t k"]:
     """Probabilities of step, obstacle and tilt failures for every trajectory of every map.
 
     heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model is for others
     model:   folder of a training run, or .safetensors file; the hazard field for the Seekur Jr that comes with the
              package unless given
-    Returns [n, t, 3], or [t, 3] for one map. Raises InputError for heights or a model that cannot be.
+    Returns [n, t, 3], or [t, 3] for one map; more where the model's robot has further events. Raises InputError for
+    heights or a model that cannot be.
     """
     return Predictor.load(model).predict(heights).probability

@@ -88,7 +88,7 @@ class Run:
 
         Raises InputError for weights that are not for it.
         """
-        return self.kind.create(self.preset, seed, weights)
+        return self.kind.create(self.preset, self.robot, seed, weights)
 
     def source(self, heights: np.ndarray, on_progress: Progress = lambda count: None) -> Any:
         """Returns maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""

@@ -6,6 +6,21 @@ robot geometry, action space and grid only (SPEC sections 4 and 5). Everything i
 An even number of point turns maps the action space onto itself when the map is turned by 180 degrees, and a set of
 radii that comes in +- pairs does so when the map is mirrored. Tables are then needed for one arc of each orbit only,
 and the kernel simulates it on the map and on its turned and mirrored images side by side (the "views" below).
+
+Dimensions of arrays, here and in traverse.py:
+
+    T   trajectories of the action space
+    F   first arcs of a table, one of each orbit
+    R   second arcs after each first one, as many as there are radii
+    S1  simulated poses of a first arc, the junction included
+    S2  simulated poses of a second arc after the junction
+    P   poses of a first arc and all its second arcs, S1 + R S2: its own, then second arc by second arc
+    V   views of the map
+    K   runs of neighbouring chassis nodes that cover a pose, M single chassis nodes beside them
+    C   chunks of a table, which the kernel simulates one after the other
+    A   first arcs of a chunk
+    E   failure events of the robot
+    n   maps; "lanes" are the V n views of all maps, side by side
 """
 
 import math
@@ -64,19 +79,14 @@ class Layout:
 
     grid: Grid
     views: tuple[View, ...]
-    poses: int
-    """P, simulated poses of a first arc and all its second arcs."""
-    first_poses: int
-    """S1, simulated poses of the first arc itself, the junction included."""
-    second_arcs: int
-    """R, second arcs after each first one."""
+    poses: int  # P
+    first_poses: int  # S1
+    second_arcs: int  # R
 
 
 @dataclass(frozen=True)
 class NodeTable:
-    """Nodes and pose constants of F first arcs, each with its own S1 poses and the R S2 poses of its second arcs.
-
-    P = S1 + R S2 poses of a first arc: its own, then second arc by second arc; V views; node = row * cols + col.
+    """Nodes and pose constants of first arcs and their second arcs; node = row * cols + col.
 
     wheels:  [F, P, 4, V] int32 node under the wheels FL, FR, RL, RR, in the map as it is
     centre:  [F, P] int32 node nearest to the robot's centre, in the view

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from travjax.config import InputError, load_toml, require, require_length, require_number
+from travjax.simulation.events import OPTIONAL, PAPER, Event
 
 PRESETS = Path(__file__).parent / "robots"
 
@@ -25,6 +26,9 @@ class Robot:
     ride_height:    ground clearance under the chassis: the limit of the obstacle margin
     max_step:       limit of the step margin
     max_tilt:       limit of the tilt margin, radians
+    max_roll:       limit of the roll margin, the largest sideways slope of the pose plane as an angle, radians. Without
+                    it, as in the paper, a robot has no roll event; with it labels, tables, figures and estimators have
+                    the event after the other three
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -41,15 +45,20 @@ class Robot:
     ride_height: float
     max_step: float
     max_tilt: float = field(metadata={"angle": True})
+    max_roll: float | None = field(default=None, metadata={"angle": True, "optional": True})
 
     def __post_init__(self):
         named = isinstance(self.name, str) and 0 < len(self.name) <= LONGEST_NAME and self.name.isprintable()
         require(named, "name", self.name, f"a non-empty text of one line, at most {LONGEST_NAME} characters")
-        for one in fields(self):
-            if one.name not in ("name", "max_tilt"):
-                require_length(one.name, getattr(self, one.name), 0.001, 100)
-        allowed = "an angle from 0.01 to 90 degrees (pi/2 rad)"
-        require_number("max_tilt", self.max_tilt, math.radians(0.0099), math.pi / 2, allowed)
+        for one in fields(self)[1:]:
+            value = getattr(self, one.name)
+            if value is None and "optional" in one.metadata:
+                continue
+            if "angle" in one.metadata:
+                allowed = "an angle from 0.01 to 90 degrees (pi/2 rad)"
+                require_number(one.name, value, math.radians(0.0099), math.pi / 2, allowed)
+            else:
+                require_length(one.name, value, 0.001, 100)
         self._require_wheels_outside()
 
     def _require_wheels_outside(self) -> None:
@@ -82,9 +91,19 @@ class Robot:
         return sorted(path.stem for path in PRESETS.glob("*.toml"))
 
     @property
-    def limits(self) -> tuple[float, float, float]:
-        """Largest allowed (step [m], obstacle [m], tilt [rad])."""
-        return self.max_step, self.ride_height, self.max_tilt
+    def events(self) -> tuple[Event, ...]:
+        """The ways to fail that this robot has limits for; step, obstacle and tilt come first."""
+        return PAPER + tuple(event for event in OPTIONAL if getattr(self, event.limit) is not None)
+
+    @property
+    def event_names(self) -> tuple[str, ...]:
+        """What labels, tables and figures call its events."""
+        return tuple(event.name for event in self.events)
+
+    @property
+    def limits(self) -> tuple[float, ...]:
+        """Largest allowed margin of each event: step [m], obstacle [m], tilt [rad]."""
+        return tuple(getattr(self, event.limit) for event in self.events)
 
     def wheel_positions(self) -> tuple[tuple[float, float], ...]:
         """(right, forward) of the wheels FL, FR, RL, RR, metres."""

@@ -5,7 +5,7 @@ margins of all trajectories -> failures. First arcs are simulated once for all t
 
 On the machine the maps of a batch and their views (footprint.py) lie side by side as the fastest axis, the "lanes", so
 that one table entry reads one row of memory, and a few first arcs at a time are simulated so that their poses stay in
-the cache. What was measured to arrive here is in BUILD_NOTES.md.
+the cache. BUILD_NOTES.md has what was measured to arrive here, footprint.py what the letters in shapes stand for.
 """
 
 from dataclasses import dataclass
@@ -15,18 +15,17 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt8
+from jaxtyping import Array, Bool, UInt8
 
 from travjax.batching import in_batches, rounded
 from travjax.config import require
 from travjax.jax_flags import usual_flags
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import PAPER, UNKNOWN_LABEL, Event, Margins, Pose, label_bit, larger
 from travjax.simulation.footprint import RUN, Layout, View, chassis_places, node_table
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
-
-EVENTS = ("step", "obstacle", "tilt")
 
 FEW_MAPS = 2
 """Up to this many maps, RUN neighbouring nodes are read at once: the lanes alone would not fill a vector register."""
@@ -39,27 +38,6 @@ NODES_AT_ONCE = 8
 
 UNKNOWN_HEIGHT = 1e30
 """Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["step", "obstacle", "tilt", "known"], meta_fields=[])
-@dataclass(frozen=True)
-class Margins:
-    """How far every trajectory goes towards each failure; NaN where unknown.
-
-    step:     [n, t] metres, largest change of a wheel's contact height between poses
-    obstacle: [n, t] metres, largest height of ground under the chassis above the pose plane
-    tilt:     [n, t] radians, largest slope of the pose plane
-    known:    [n, t] False where wheels or chassis touch unknown ground
-    """
-
-    step: Float[Array, "*n t"]
-    obstacle: Float[Array, "*n t"]
-    tilt: Float[Array, "*n t"]
-    known: Bool[Array, "*n t"]
-
-    def events(self) -> Float[Array, "*n t 3"]:
-        """The three margins in the order of EVENTS."""
-        return jnp.stack([self.step, self.obstacle, self.tilt], axis=-1)
 
 
 @lru_cache(maxsize=1)
@@ -110,16 +88,21 @@ def simulate(
 
     def simulate_batch(batch: jax.Array) -> Margins:
         chunks, source = _device_tables(robot, actions, grid, len(batch))
-        return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout)
+        return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout, robot.events)
 
     margins = in_batches(simulate_batch, maps)
     return jax.tree.map(lambda margin: margin[0], margins) if alone else margins
 
 
 @usual_flags()
-def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t 3"]:
-    """Which margins exceed the robot's limits, in the order of EVENTS; False where unknown."""
-    return margins.events() > jnp.asarray(chosen_robot(robot).limits, jnp.float32)
+def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t k"]:
+    """Which margins exceed the robot's limits, in the order of its events; False where unknown.
+
+    Raises InputError when the margins lack one of its events.
+    """
+    robot = chosen_robot(robot)
+    chosen = jnp.stack([margins[name] for name in robot.event_names], axis=-1)
+    return chosen > jnp.asarray(robot.limits, jnp.float32)
 
 
 @usual_flags()
@@ -129,27 +112,29 @@ def label(
     actions: ActionSpace | None = None,
     *,
     grid: Grid = Grid(),
-) -> Bool[Array, "*n t 3"]:
-    """Failures (step, obstacle, tilt) of every trajectory on every map: [n, t, 3]; arguments and errors of `simulate`.
+) -> Bool[Array, "*n t k"]:
+    """Failures of every trajectory on every map; arguments and errors of `simulate`.
 
-    False where a trajectory is unknown as well: read it together with `simulate(...).known`.
+    Returns [n, t, 3] of step, obstacle and tilt; more where the robot has limits for further events. False where a
+    trajectory is unknown as well: read it together with `simulate(...).known`.
     """
     return failures(simulate(heights, robot, actions, grid=grid), robot)
 
 
 @usual_flags()
 @jax.jit
-def packed(failed: Bool[Array, "*n t 3"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
-    """Labels in one byte a trajectory: bits 0 to 2 the failures in the order of EVENTS, bit 3 unknown."""
-    bits = jnp.concatenate([failed, ~known[..., None]], axis=-1)
-    return (bits << jnp.arange(4, dtype=jnp.int32)).sum(axis=-1).astype(jnp.uint8)
+def packed(failed: Bool[Array, "*n t k"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
+    """Labels in one byte a trajectory: bits 0 to 2 step, obstacle and tilt, 3 unknown, 4 on further events."""
+    bits = [failed[..., event].astype(jnp.uint8) << label_bit(event) for event in range(failed.shape[-1])]
+    return reduce(jnp.bitwise_or, bits, jnp.where(known, jnp.uint8(0), jnp.uint8(UNKNOWN_LABEL)))
 
 
 @usual_flags()
-def unpacked(labels) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
-    """The (failed, known) that `packed` was given, from its labels: [n, t] uint8."""
-    bits = (jnp.asarray(labels)[..., None] >> jnp.arange(4, dtype=jnp.uint8)) & 1
-    return bits[..., :3].astype(bool), bits[..., 3] == 0
+def unpacked(labels, robot: Robot | str | None = None) -> tuple[Bool[Array, "*n t k"], Bool[Array, "*n t"]]:
+    """The (failed, known) that `packed` was given, from its labels of a robot: [n, t] uint8."""
+    labels, count = jnp.asarray(labels), len(chosen_robot(robot).events)
+    bits = jnp.array([1 << label_bit(event) for event in range(count)], jnp.uint8)
+    return (labels[..., None] & bits) > 0, (labels & UNKNOWN_LABEL) == 0
 
 
 @partial(
@@ -159,10 +144,10 @@ def unpacked(labels) -> tuple[Bool[Array, "*n t 3"], Bool[Array, "*n t"]]:
 )
 @dataclass(frozen=True)
 class _Chunks:
-    """The pose arrays of a NodeTable cut into C chunks of A first arcs, laid out in the order in which they are read.
+    """The pose arrays of a NodeTable cut into chunks, laid out in the order in which they are read.
 
-    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, K / k, A P, 2, k] for k places in
-    one step of the kernel's scan.
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], the steps
+    those of the kernel's scan
     """
 
     wheels: jax.Array
@@ -200,7 +185,7 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
-    """[C, P, 2, K] -> [C, K / k, P, 2, k] with k near NODES_AT_ONCE."""
+    """[C, A P, 2, K] -> [C, steps, A P, 2, places], with about NODES_AT_ONCE places in a step."""
     chunks, poses, _, count = places.shape
     steps = -(-count // NODES_AT_ONCE)
     places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
@@ -208,8 +193,10 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
     return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
 
 
-@partial(jax.jit, static_argnames="layout")
-def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -> Margins:
+@partial(jax.jit, static_argnames=("layout", "events"))
+def _simulate(
+    maps, chunks: _Chunks, source, wheelbase, track, layout: Layout, events: tuple[Event, ...] = PAPER
+) -> Margins:
     grid = layout.grid
     centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
     heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN_HEIGHT)
@@ -220,40 +207,42 @@ def _simulate(maps, chunks: _Chunks, source, wheelbase, track, layout: Layout) -
     def simulate_chunk(chunk: _Chunks) -> jax.Array:
         contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
         plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
-        obstacle = _highest_above(views, plane, chunk, grid.nodes)
-        return _arc_maxima(contact, plane.slope, obstacle, layout)
+        clearance = _highest_above(views, plane, chunk, grid.nodes)
+        return _arc_maxima(contact, plane, clearance, layout, events)
 
-    maxima = jax.lax.map(simulate_chunk, chunks).transpose(1, 0, 2, 3, 4).reshape(4, -1, len(maps))
-    step, slope, obstacle, contact = maxima[:, source].transpose(0, 2, 1)
-    known = (contact < UNKNOWN_HEIGHT / 2) & (obstacle < UNKNOWN_HEIGHT / 2)
-    tilt = jnp.arctan(jnp.sqrt(slope))
-    step, obstacle, tilt = (jnp.where(known, margin, jnp.nan) for margin in (step, obstacle, tilt))
-    return Margins(step, obstacle, tilt, known)
+    maxima = jax.lax.map(simulate_chunk, chunks).transpose(1, 0, 2, 3, 4).reshape(len(events) + 1, -1, len(maps))
+    *largest, highest = maxima[:, source].transpose(0, 2, 1)
+    known = highest < UNKNOWN_HEIGHT / 2
+    margins = [event.margin(value) for event, value in zip(events, largest, strict=True)]
+    step, obstacle, tilt, *optional = (jnp.where(known, margin, jnp.nan) for margin in margins)
+    return Margins(step, obstacle, tilt, known, tuple(optional), tuple(event.name for event in events))
 
 
 def _view_lanes(by_node: jax.Array, views: tuple[View, ...], grid: Grid) -> jax.Array:
-    """[nodes, V n]: the map and its turned and mirrored images side by side."""
+    """[nodes, lanes]: the map and its turned and mirrored images side by side."""
     image = by_node.reshape(*grid.shape, -1)
     return jnp.concatenate([jnp.flip(image, view.flipped) for view in views], axis=-1).reshape(len(by_node), -1)
 
 
 def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
-    """Contact heights of the wheels: [4, P, V n]."""
+    """Contact heights of the wheels: [4, A P, lanes]."""
     heights = by_node.at[wheels].get(mode="promise_in_bounds")
     return heights.reshape(*heights.shape[:2], -1)
 
 
 @dataclass(frozen=True)
 class _Planes:
-    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [P, lanes] each.
+    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [A P, lanes] each.
 
-    slope: the square of the plane's slope.
+    pitch, roll, steepness: as in events.Pose
     """
 
     level: jax.Array
     east: jax.Array
     north: jax.Array
-    slope: jax.Array
+    pitch: jax.Array
+    roll: jax.Array
+    steepness: jax.Array
 
 
 def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
@@ -267,24 +256,24 @@ def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: 
     cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
     east = (roll * cos - rounded(pitch * sin)) * spacing
     north = (roll * sin + rounded(pitch * cos)) * spacing
-    slope = pitch * pitch + rounded(roll * roll)
-    east, north, slope = jax.lax.optimization_barrier((east, north, slope))
+    steepness = pitch * pitch + rounded(roll * roll)
+    east, north, steepness = jax.lax.optimization_barrier((east, north, steepness))
     middle = (front_left + front_right + rear_left + rear_right) / 4
     level = middle - rounded(east * chunk.offset[:, :1]) - north * chunk.offset[:, 1:]
-    return _Planes(jax.lax.optimization_barrier(level), east, north, slope)
+    return _Planes(jax.lax.optimization_barrier(level), east, north, pitch, roll, steepness)
 
 
 def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
-    """Largest height of a chassis node above the pose plane: [P, lanes]."""
+    """Largest height of a chassis node above the pose plane: [A P, lanes]."""
     highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
     if not len(chunk.runs):
         return highest
     in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, RUN, cols)
-    return reduce(_larger, jnp.split(in_runs, RUN, axis=1), highest)
+    return reduce(larger, jnp.split(in_runs, RUN, axis=1), highest)
 
 
 def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
-    """Largest height above the pose plane over the places, for each of the `run` nodes of a place: [P, run * lanes]."""
+    """Largest height above the pose plane over the places, of each of the `run` nodes of one: [A P, run * lanes]."""
     nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
     aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
     level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
@@ -295,39 +284,52 @@ def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> 
             height = nodes.at[centre + row.astype(jnp.int32) * cols + col].get(mode="promise_in_bounds")
             columns = col.astype(jnp.float32)[:, None] + aside
             above = height - (level + east * columns + north * row.astype(jnp.float32)[:, None])
-            highest = _larger(above, highest)
+            highest = larger(above, highest)
         return highest, None
 
     return jax.lax.scan(step, jnp.full_like(level, -UNKNOWN_HEIGHT), places)[0]
 
 
-def _arc_maxima(contact: jax.Array, slope: jax.Array, obstacle: jax.Array, layout: Layout) -> jax.Array:
-    """Maxima of (step, slope, obstacle, contact) over the poses of each of A first arcs and R second arcs.
+def _arc_maxima(
+    contact: jax.Array, plane: _Planes, clearance: jax.Array, layout: Layout, events: tuple[Event, ...]
+) -> jax.Array:
+    """Returns the largest value of each event, and the largest height of contacts and chassis nodes, along both arcs.
 
-    Returns [4, A, R, lanes].
+    [E + 1, A, R, lanes]
+    """
+    maxima = []
+    for poses in _arc_poses(contact, plane, clearance, layout):
+        values = [reduce(larger, map(event.value, poses)) for event in events]
+        # Place by place along the arc, so that the obstacle event and this share the maximum of the clearances.
+        ground = zip(*((*pose.contact, pose.clearance) for pose in poses), strict=True)
+        highest = reduce(larger, (reduce(larger, heights) for heights in ground))
+        # The barrier keeps XLA from computing the maxima of a first arc anew for each second arc.
+        maxima.append(jax.lax.optimization_barrier(jnp.stack([*values, highest])))
+    return larger(*maxima)
+
+
+def _arc_poses(contact: jax.Array, plane: _Planes, clearance: jax.Array, layout: Layout) -> tuple[list[Pose], ...]:
+    """Returns the poses along the first arcs, their arrays [A, 1, lanes], and along the second arcs, [A, R, lanes].
+
+    What no event asks for is not computed: XLA leaves out what has no use.
     """
 
-    def poses(field):
-        """One array for each pose along the arcs: [..., A, 1, lanes] on the first, [..., A, R, lanes] on the second."""
-        field = field.reshape(*field.shape[:-2], -1, layout.poses, field.shape[-1])
-        first, second = field[..., : layout.first_poses, :], field[..., layout.first_poses :, :]
-        second = second.reshape(*second.shape[:-2], layout.second_arcs, -1, second.shape[-1])
-        along_first = [first[..., pose : pose + 1, :] for pose in range(first.shape[-2])]
-        return along_first, [second[..., pose, :] for pose in range(second.shape[-2])]
+    def along(field: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+        field = field.reshape(-1, layout.poses, field.shape[-1])
+        first, second = field[:, : layout.first_poses], field[:, layout.first_poses :]
+        second = second.reshape(len(second), layout.second_arcs, -1, second.shape[-1])
+        along_first = [first[:, pose, None] for pose in range(first.shape[1])]
+        return along_first, [second[:, :, pose] for pose in range(second.shape[2])]
 
-    change = lambda along: [jnp.abs(b - a) for a, b in pairwise(along)]
-    wheels = [poses(field) for field in contact]
-    slopes, obstacles = poses(slope), poses(obstacle)
-    steps = [(change(first), change([first[-1], *second])) for first, second in wheels]
-    maxima = []
-    for part in (0, 1):
-        along = lambda fields: reduce(_larger, fields[part])  # noqa: B023
-        step, contact = (reduce(_larger, map(along, fields)) for fields in (steps, wheels))
-        # The barrier keeps XLA from computing the maxima of a first arc anew for each second arc.
-        maxima.append(jax.lax.optimization_barrier(jnp.stack([step, along(slopes), along(obstacles), contact])))
-    return _larger(*maxima)
+    wheels = [along(field) for field in contact]
+    others = [along(field) for field in (plane.pitch, plane.roll, plane.steepness, clearance)]
+    first, second = (list(zip(*(wheel[part] for wheel in wheels), strict=True)) for part in (0, 1))
+    arcs = []
+    for part, heights in enumerate(([first[0], *first], [first[-1], *second])):
+        rest = zip(*(field[part] for field in others), strict=True)
+        arcs.append([Pose(b, _changes(a, b), *more) for (a, b), more in zip(pairwise(heights), rest, strict=True)])
+    return tuple(arcs)
 
 
-def _larger(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Maximum of numbers: one instruction, where jnp.maximum also looks for NaN."""
-    return jnp.where(a > b, a, b)
+def _changes(before: tuple[jax.Array, ...], after: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+    return tuple(b - a for a, b in zip(before, after, strict=True))

@@ -24,9 +24,10 @@ from travjax.models.trajectory_resnet import create
 from travjax.models.variables import VARIABLES, split_model
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import EVENTS, unpacked
+from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
 
 COLUMNS = {
@@ -56,7 +57,7 @@ class Bench:
         self.repeats, self.devices = repeats, Devices.all()
         self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
         self.source = self.devices.replicate(ImageSource.from_maps(self.dataset.heights, robot, actions, grid, 1.0))
-        self.graph, self.variables = split_model(create(trunk))
+        self.graph, self.variables = split_model(create(trunk, events=robot.event_names))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
@@ -78,7 +79,9 @@ class Bench:
         def batch():
             chosen = batches(self.sampler.epoch(next(epochs)), BATCH, 0, 0)
             samples = self.devices.shard((chosen[0][0], chosen[1][0]))
-            return self.source.images(*samples), unpacked(self.dataset.labels[chosen[0][0], chosen[1][0]])[0]
+            return self.source.images(*samples), unpacked(
+                self.dataset.labels[chosen[0][0], chosen[1][0]], self.dataset.robot
+            )[0]
 
         return self._timed("inputs of a batch, a fresh subset of 64 maps included", BATCH, batch)
 
@@ -90,7 +93,7 @@ class Bench:
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}
         state = self.devices.replicate(state)
         maps, trajectories = (index[:STEP_BATCH] for index in self.sampler.epoch(0))
-        failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories])[0], np.float32)
+        failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories], self.dataset.robot)[0], np.float32)
         inputs = phase.place(self.source, (maps, trajectories), self.devices)
         batch = Batch(inputs, *self.devices.shard((failed, np.ones(STEP_BATCH, np.float32))))
 

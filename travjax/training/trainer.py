@@ -259,7 +259,7 @@ class Trainer:
         failed = self.data.failed(self.data.validation)
         share = failed.mean(axis=0, dtype=np.float64)
         constant = sum(-(p * math.log(p) + (1 - p) * math.log(1 - p)) for p in share if 0 < p < 1)
-        scores = metrics.evaluate(probabilities(logits), failed.astype(bool))
+        scores = metrics.evaluate(probabilities(logits), failed.astype(bool), events=self.run.robot.event_names)
         return {
             "validation_loss": float(optax.sigmoid_binary_cross_entropy(logits, failed).sum(axis=-1).mean()),
             "constant_loss": constant,
@@ -271,11 +271,13 @@ class Trainer:
         """Confusion and average precision of each event, and overall, on the watched samples."""
         names = [name for name in self.scored if name != "validation"]
         failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
-        scores = {name: metrics.evaluate(probabilities(self._logits(name)), failed[name]).scores for name in names}
+        events = self.run.robot.event_names
+        score = lambda name: metrics.evaluate(probabilities(self._logits(name)), failed[name], events=events).scores
+        scores = {name: score(name) for name in names}
         return {"watched": metrics.json_ready(scores)} if names else {}
 
     def _logits(self, name: str) -> np.ndarray:
-        """Returns the logits of the samples of that name, by the present state: [k, 3]."""
+        """Returns the logits of the samples of that name, by the present state: [k, events]."""
         if frozen := self.phase.frozen_trunk:
             features = self.devices.replicate(self.features[name])
             logits = self.devices.fetch(frozen.logits(self.graph, self._variables, features))
@@ -326,7 +328,8 @@ class Trainer:
 
 def _summary(here: Position, row: dict[str, Any], best: bool) -> str:
     shown = lambda value: "-" if value is None else f"{value:.3f}"
-    precision = ", ".join(f"{name} {shown(row['average_precision'][name])}" for name in metrics.NAMES)
+    precisions = {name: value for name, value in row["average_precision"].items() if name != "mean"}
+    precision = ", ".join(f"{name} {shown(value)}" for name, value in precisions.items())
     losses = f"loss {row['loss']:.3f}, validation {row['validation_loss']:.3f} (constant {row['constant_loss']:.3f})"
     rate = f"{row['samples_per_s']:.0f} samples/s"
     star = ", best so far" if best else ""
