@@ -8,34 +8,38 @@ import pytest
 import travjax
 
 LAYERS = {
-    "": "config signals locks files progress jax_flags batching devices entry",
-    "simulation": "arrays grid heights robot actions footprint traverse reference",
+    "": "config signals locks memory files npz_stream progress jax_flags batching devices",
+    "simulation": "arrays grid heights robot actions footprint setup traverse reference",
     "terrain": "noise landforms rock_field styles",
-    "rasters": "coordinates reading_options memory formats raster gdal_files array_files holes surface",
+    "rasters": "coordinates reading_options formats raster gdal_files array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
-    "data": "dem map_batches npz_stream sensor_noise sampling provenance dataset_json dataset sites tfds_export",
+    "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights",
     "models": "names input_images trajectory_resnet pose_stencil hazard_field",
-    "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
-    "simulator_benchmark",
-    "runs": "checkpoint preset map_samples inference run_log run model_file predictor",
-    "training": "trajectory_samples step trainer map_training evaluator network_benchmark",
-    "commands": "options terrain label dataset weights train evaluate export predict bench",
-    "experiments": "launch transfer_runs stand_ins robustness robustness_scores synthetic transfer timing comparison",
+    "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
+    "runs": "checkpoint preset map_samples inference run_log run model_file model_card predictor prediction_report",
+    "training": "trajectory_samples step trainer map_training fit evaluator evaluation_report network_benchmark",
+    "programs": "entry options",
+    "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
+    "timing comparison",
+    "commands": "terrain label dataset weights train evaluate export predict bench",
     "program": "cli",
 }
-"""Packages from the bottom to the top, "" and "program" being travjax itself; in each, its modules likewise."""
+"""Packages from the bottom to the top, those of TOP being travjax itself; in each, its modules likewise."""
+
+TOP = ("", "programs", "program")
+"""Layers of modules that lie in no package."""
 
 MOST = 10
 """Modules in a package."""
 
 ORDER = [
-    f"{package}.{module}" if package not in ("", "program") else module
+    f"{package}.{module}" if package not in TOP else module
     for package, modules in LAYERS.items()
     for module in modules.split()
 ]
-FREE = ["__init__", "__main__", *(f"{package}.__init__" for package in LAYERS if package not in ("", "program"))]
-PACKAGES = ["travjax", *(f"travjax.{package}" for package in LAYERS if package)]
+FREE = ["__init__", "__main__", *(f"{package}.__init__" for package in LAYERS if package not in TOP)]
+PACKAGES = ["travjax", *(f"travjax.{package}" for package in LAYERS if package not in TOP)]
 PACKAGE = Path(travjax.__file__).parent
 MODULES = sorted(".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py"))
 

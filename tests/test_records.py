@@ -18,8 +18,8 @@ from travjax.data import dataset_json
 from travjax.data.dataset import Dataset, is_dataset, load, save
 from travjax.data.provenance import SiteRecord, SitesConfig
 from travjax.evaluation.dataset_tables import statistics_table, windows_table
-from travjax.evaluation.transfer_scores import Epoch
 from travjax.experiments.transfer_runs import TransferConfig
+from travjax.experiments.transfer_scores import Epoch
 from travjax.runs.preset import Preset, TrainingConfig
 from travjax.runs.run import Run, checked_meta
 from travjax.simulation.actions import ActionSpace

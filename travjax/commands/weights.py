@@ -4,8 +4,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from travjax import progress
-from travjax.commands import options
+from travjax import options, progress
 from travjax.config import InputError, require
 from travjax.files import output_folder, user_path
 from travjax.resnet.preprocessing import INPUTS

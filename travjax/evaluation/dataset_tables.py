@@ -4,6 +4,7 @@ Counted from the packed labels a few maps at a time, since a data set of the pap
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -12,7 +13,8 @@ from travjax.data.dataset import SPLITS, Dataset
 from travjax.data.provenance import Provenance
 from travjax.data.sampling import FAILED, MAPS_AT_ONCE, UNKNOWN_LABEL, Samples, balanced_subset
 from travjax.evaluation.tables import PAPER_SHARES, rows_table
-from travjax.simulation.traverse import EVENTS
+from travjax.files import first_lines
+from travjax.simulation.traverse import EVENTS, as_in_paper
 
 COLUMNS = {
     "what": "",
@@ -37,6 +39,25 @@ WINDOW_COLUMNS = {
 
 CODES = 2 * UNKNOWN_LABEL
 """A label is a number below this."""
+
+
+def dataset_tables(dataset: Dataset) -> dict[str, str]:
+    """Returns tables by their headlines: the shares that fail and, of real maps, what became of the windows."""
+    in_paper = dataset.config is not None and as_in_paper(dataset.robot, dataset.actions)
+    sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
+    trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
+    headline = f"{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:"
+    tables = {headline: statistics_table(dataset, as_in_paper=in_paper)}
+    if dataset.provenance:
+        copies = int((dataset.provenance.quarter_turns > 0).sum())
+        headline = f"Windows of the sites, beside which {copies} maps are turned copies:"
+        tables[headline] = windows_table(dataset.provenance)
+    return tables
+
+
+def are_statistics(path: Path) -> bool:
+    """Tells whether a file holds the tables of a data set: its first line is that of the headings."""
+    return [line.split() for line in first_lines(path, 1)] == [" ".join(COLUMNS.values()).split()]
 
 
 def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True) -> str:

@@ -17,7 +17,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from travjax import progress
 from travjax.config import InputError
+from travjax.evaluation import map_figures
+from travjax.evaluation.tables import rows_table
+from travjax.files import atomic_write, output_folder
 from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -66,6 +70,40 @@ def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
             reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)
     except ValueError as error:
         raise InputError(f"sequential simulator: {' '.join(str(error).split())}") from None
+
+
+def measure(
+    robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15, stream: int = 0
+) -> None:
+    """Measures terrain, labelling and the sequential simulator; prints the table and writes it as TSV and a figure.
+
+    repeats: timed calls of which the median is taken
+    stream:  maps to make and label besides, 0 for none
+    Raises InputError as `check` does, and when nothing can be written to `out`.
+    """
+    check(robot, actions, grid)
+    folder, rows = output_folder(out), [start_row()]
+    # First calls are to compile, not to read the cache.
+    jax.config.update("jax_enable_compilation_cache", False)
+    measured = kernel_rows(robot, actions, grid, repeats)
+    rows += list(progress.bar("kernels", 2 * len(BATCHES), "row", iterable=measured))
+    with progress.bar("sequential simulator", len(actions), "trajectory") as bar:
+        rows.append(reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
+    if stream:
+        with progress.bar("stream", stream, "map") as bar:
+            rows.append(stream_row(stream, robot, actions, grid, bar.update))
+    rows = with_speed_up(rows)
+    write_rows(rows, COLUMNS, folder / "bench.tsv")
+    kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
+    progress.wrote(map_figures.save(map_figures.speed_figure(kernels), folder / "bench.png"))
+
+
+def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
+    """Prints the table of measured rows with the machine, and writes it as TSV; columns: their headings."""
+    progress.say(f"\n{machine()}\n{rows_table(rows, columns)}\n")
+    with atomic_write(path) as temporary:
+        write_tsv(rows, temporary, columns)
+    progress.wrote(path)
 
 
 def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:

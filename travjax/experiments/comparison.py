@@ -18,7 +18,7 @@ from typing import Any
 from travjax import progress
 from travjax.config import InputError, require, to_json
 from travjax.data.provenance import SitesConfig
-from travjax.evaluation import map_figures, metrics, score_figures, simulator_benchmark
+from travjax.evaluation import map_figures, metrics, simulator_benchmark
 from travjax.evaluation.metrics import OVERALL
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch, timing
@@ -34,8 +34,11 @@ from travjax.experiments.robustness_scores import (
     f1_of,
     f1_of_site,
     on_sites,
+    quality_figure,
     quality_table,
+    robustness_figure,
     shown,
+    sites_figure,
     sites_table,
 )
 from travjax.files import find_data, output_folder, save_text, user_path
@@ -247,8 +250,8 @@ def _on_synthetic_ground(
     save_text(out / "f1.tsv", "\n".join(lines) + "\n")
     seconds = {row["what"]: row["seconds"] for row in rows}
     figures = {
-        "robustness": score_figures.robustness_figure(f1),
-        "quality": score_figures.quality_figure(_points(f1, seconds)),
+        "robustness": robustness_figure(f1),
+        "quality": quality_figure(_points(f1, seconds)),
     }
     tables = {
         "Quality": f"{quality_table(clean)}\n\n{margins}",
@@ -279,7 +282,7 @@ def _on_real_ground(
     table = sites_table(scores, chosen)
     save_text(out / "sites.txt", f"{headline}\n\n{table}\n")
     f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
-    figure = map_figures.save(score_figures.sites_figure(f1, IN_FIGURE), out / "sites.png")
+    figure = map_figures.save(sites_figure(f1, IN_FIGURE), out / "sites.png")
     numbers = {
         "sites": to_json(config),
         "windows": {site: len(ground.heights) for site, ground in real.items()},

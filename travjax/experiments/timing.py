@@ -11,8 +11,7 @@ from pathlib import Path
 
 import jax
 
-from travjax import progress
-from travjax.commands import options
+from travjax import options, progress
 from travjax.config import require
 from travjax.devices import Devices
 from travjax.evaluation import map_figures, simulator_benchmark
@@ -77,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and writes the table, a figure and the report."""
-    grid, robot, actions = options.configuration(arguments)
+    grid, robot, actions = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.batch > 0, "--batch", arguments.batch, "at least 1")
     Devices.all().check_batch(arguments.batch)

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax import progress
-from travjax.commands import evaluate, train
+from travjax import options, progress
 from travjax.config import InputError, load_toml, read_text, require, to_json
 from travjax.experiments import launch
 from travjax.files import find_preset, held, put_back, save_text, user_path
@@ -61,8 +60,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="folder of a training run on synthetic maps, instead of a new one",
     )
     synthetic = parser.add_argument_group("the synthetic model, unless a folder of it is given")
-    train.add_run(synthetic)
-    parser.set_defaults(of_synthetic={action.dest: action.default for action in synthetic._group_actions})
+    options.add_run(synthetic)
+    parser.set_defaults(of_synthetic={name: parser.get_default(name) for name in options.RUN_OPTIONS})
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -77,9 +76,9 @@ def run(arguments: argparse.Namespace) -> None:
 def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     """The experiment of a preset in a folder that no other process uses."""
     from travjax.devices import Devices
-    from travjax.evaluation.transfer_scores import Results
     from travjax.experiments.stand_ins import chosen_stand_ins
     from travjax.experiments.transfer_runs import Transfer, TransferConfig, run_all
+    from travjax.experiments.transfer_scores import Results
 
     config = load_toml(path, TransferConfig)
     sites = path.parent / user_path(config.sites)
@@ -116,7 +115,7 @@ def _base(preset: Path, arguments: argparse.Namespace):
     from travjax.runs.run import Run
 
     if not arguments.synthetic:
-        return train.run_of(Preset.load(preset), arguments)
+        return options.run_of(Preset.load(preset), arguments)
     for name, default in arguments.of_synthetic.items():
         given = getattr(arguments, name)
         require(given == default, f"--{name}", given, "left out where --synthetic is given")
@@ -125,9 +124,12 @@ def _base(preset: Path, arguments: argparse.Namespace):
 
 def _train_synthetic(base, folder: Path, devices) -> None:
     """Trains and evaluates the synthetic model as far as that is not done."""
-    train.train(base, folder, devices, resume=True)
+    from travjax.training.evaluation_report import evaluate_run
+    from travjax.training.fit import fit
+
+    fit(base, folder, devices, resume=True)
     if not (folder / TABLES).exists():
-        evaluate.evaluate(folder)
+        evaluate_run(folder)
 
 
 TABLES = "evaluation/tables.txt"
@@ -144,22 +146,22 @@ def _data(sites: Path, given: Path | None, base, out: Path, stand_ins):
     put_back(out / DATA)
     if (out / DATA / "dataset.json").exists():
         return dataset.load(out / DATA)
-    from travjax.commands.dataset import made_of_sites
+    from travjax.data.build import build_from_sites
     from travjax.data.provenance import SitesConfig
 
     if stand_ins:
         stand_ins.write()
     config = stand_ins.sites if stand_ins else SitesConfig.load(sites)
-    return made_of_sites(config, base.robot, base.actions, base.grid, out / DATA)
+    return build_from_sites(config, base.robot, base.actions, base.grid, out / DATA)
 
 
 def _write(transfer, results, out: Path, stand_ins) -> None:
     """Tables, figures, JSON and the report."""
-    from travjax.evaluation import map_figures, score_figures
+    from travjax.evaluation import map_figures
     from travjax.evaluation.dataset_tables import statistics_table
     from travjax.evaluation.simulator_benchmark import machine
-    from travjax.evaluation.transfer_scores import arms_table, events_table, results_json
     from travjax.experiments.transfer_runs import IMAGENET
+    from travjax.experiments.transfer_scores import arms_table, events_table, results_json, transfer_figure
 
     config, base = transfer.config, transfer.base
     kind = "stand-in" if stand_ins else "real"
@@ -172,7 +174,7 @@ def _write(transfer, results, out: Path, stand_ins) -> None:
     for title, table in tables.items():
         print(f"\n{title}\n{table}")
     print()
-    figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
+    figures = [map_figures.save(transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
     if stand_ins:
         figures.append(map_figures.save(stand_ins.figure(), out / "stand_in_sites.png"))
     if config.shown_maps:

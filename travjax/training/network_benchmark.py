@@ -8,13 +8,17 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import numpy as np
 
+from travjax import progress
 from travjax.data.dataset import DatasetConfig, generate
 from travjax.data.sampling import Sampler, batches
 from travjax.devices import Devices
+from travjax.evaluation import simulator_benchmark
+from travjax.files import output_folder
 from travjax.models.input_images import ImageSource
 from travjax.models.trajectory_resnet import VARIABLES, create, split_model
 from travjax.resnet.network import ResNetConfig
@@ -137,6 +141,17 @@ class Bench:
             "repeats": len(seconds) - 1,
             "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
+
+
+def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15) -> None:
+    """Measures inputs, a training step and all trajectories of a map; prints the table and writes it as TSV.
+
+    repeats: timed calls of which the median is taken
+    Raises InputError when nothing can be written to `out`.
+    """
+    folder = output_folder(out)
+    rows = list(progress.bar("network", 4, "row", iterable=Bench(robot, actions, grid, repeats).rows()))
+    simulator_benchmark.write_rows(with_ratio(rows), COLUMNS, folder / "network.tsv")
 
 
 def with_ratio(rows: list[dict]) -> list[dict]:

@@ -1,4 +1,4 @@
-"""What came of the transfer experiment: scores of every arm, seed, epoch and held-out site, in tables and JSON.
+"""Scores of the transfer experiment: of every arm, seed, epoch and held-out site, in tables, JSON and a figure.
 
 Everything is made from the confusions that training wrote to metrics.jsonl, at a threshold of 0.5. Figures of several
 seeds are their mean and, after the sign, their standard deviation.
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from travjax.config import require
-from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, json_ready
+from travjax.config import one_line, require
+from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, THRESHOLD, Confusion, json_ready
 from travjax.evaluation.tables import rows_table, with_notes
 
 ALL = "all held-out"
@@ -257,3 +258,28 @@ def results_json(results: Results) -> dict:
     arms = {arm: {str(seed): run(one) for seed, one in seeds.items()} for arm, seeds in results.arms.items()}
     always = {site: {event: results.always(site, event) for event in NAMES} for site in results.sites}
     return {"arms": arms, "always_fails": json_ready(always)}
+
+
+def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
+    """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+
+    arms: their colours; maps: what they are trained on
+    Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
+    """
+    figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
+    for ax, site in zip(axes, results.sites, strict=True):
+        for arm in results.arms:
+            colour = arms[arm]
+            f1 = np.nan_to_num(results.f1(arm, site))
+            epochs = np.arange(f1.shape[1])
+            ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+            ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
+        always = results.always(site)
+        ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
+        ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
+        ax.set(xlabel=f"epoch on {maps}", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    axes[0].legend(fontsize=9)
+    return figure
