@@ -1,5 +1,6 @@
 """A module of travjax imports only modules below it: of a package further down, or of its own further down."""
 
+import argparse
 import ast
 from pathlib import Path
 
@@ -100,3 +101,58 @@ def test_the_sequential_simulator_shares_no_code_with_the_package():
 
 def test_modules_are_found_at_all():
     assert {"config", "simulation.reference", "simulation.traverse", "__init__"} <= set(MODULES)
+
+
+# ---- Commands parse, call and print; the library and the experiments do without them
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module != "cli"])
+def test_only_the_command_line_imports_commands(module):
+    imported = imports_of((PACKAGE / f"{module.replace('.', '/')}.py").read_text())
+    assert [name for name in imported if name.split(".")[0] == "commands"] == []
+
+
+def misused(source: str) -> list[str]:
+    """What of argparse a module should leave alone: private attributes, and namespaces that are built by hand."""
+    tree = ast.parse(source)
+    if not any(
+        "argparse" in ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)
+    ):
+        return []
+    parser = argparse.ArgumentParser()
+    private = {
+        name
+        for thing in (argparse, parser, parser.add_subparsers(), parser.add_argument_group())
+        for name in dir(thing)
+        if name.startswith("_") and not name.startswith("__")
+    }
+    called = [ast.unparse(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    read = [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    named = [alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    namespaces = [name for name in called if name.split(".")[-1] == "Namespace"]
+    return namespaces + [name for name in read + named if name in private]
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("def f(arguments: argparse.Namespace): return arguments.out", []),
+        ("argparse.Namespace(out=1)", ["argparse.Namespace"]),
+        ("from argparse import Namespace\nNamespace(**vars(given))", ["Namespace"]),
+        ("from argparse import _SubParsersAction", ["_SubParsersAction"]),
+        ("Commands = argparse._SubParsersAction", ["_SubParsersAction"]),
+        ("for action in group._group_actions: pass", ["_group_actions"]),
+        ("self._parser.parse_args(), self.__doc__", []),
+    ],
+)
+def test_misuse_of_argparse_is_found(source, expected):
+    assert misused(f"import argparse\n{source}") == expected
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_builds_namespaces_or_reads_what_is_private_to_argparse(module):
+    assert misused((PACKAGE / f"{module.replace('.', '/')}.py").read_text()) == []
+
+
+def test_no_public_name_is_that_of_a_module_which_would_hide_it():
+    assert set(travjax.__all__) & {name.split(".")[0] for name in MODULES} == set()

@@ -11,13 +11,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from travjax import options, progress
 from travjax.config import InputError, load_toml, read_text, require, to_json
+from travjax.data import dataset
+from travjax.data.build import build_from_sites
+from travjax.data.dataset import Dataset
+from travjax.data.provenance import SitesConfig
+from travjax.devices import Devices
+from travjax.evaluation import map_figures
+from travjax.evaluation.dataset_tables import statistics_table
+from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import launch
+from travjax.experiments.stand_ins import StandIns, chosen_stand_ins
+from travjax.experiments.transfer_runs import IMAGENET, Transfer, TransferConfig, run_all
+from travjax.experiments.transfer_scores import Results, arms_table, events_table, results_json, transfer_figure
 from travjax.files import find_preset, held, put_back, save_text, user_path
 from travjax.models.names import FIELD, MODELS, RESNET
+from travjax.runs.preset import Preset
+from travjax.runs.run import DATA, Run
 from travjax.signals import going_on
+from travjax.simulation.traverse import unpacked
+from travjax.training.evaluation_report import evaluate_run
+from travjax.training.evaluator import Evaluator
+from travjax.training.fit import fit
+from travjax.training.trajectory_samples import TrainingData
 
 DESCRIPTION = (
     "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "
@@ -75,11 +94,6 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     """The experiment of a preset in a folder that no other process uses."""
-    from travjax.devices import Devices
-    from travjax.experiments.stand_ins import chosen_stand_ins
-    from travjax.experiments.transfer_runs import Transfer, TransferConfig, run_all
-    from travjax.experiments.transfer_scores import Results
-
     config = load_toml(path, TransferConfig)
     sites = path.parent / user_path(config.sites)
     stand_ins = chosen_stand_ins(sites, out, arguments.stand_ins, arguments.data)
@@ -98,7 +112,7 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     _write(transfer, Results.from_rows(run_all(transfer, say)), out, stand_ins)
 
 
-def _require_same(out: Path, config) -> None:
+def _require_same(out: Path, config: TransferConfig) -> None:
     """Keeps the configuration in the folder, and refuses a folder with another one."""
     path = out / "config.json"
     text = json.dumps(to_json(config), indent=1) + "\n"
@@ -109,11 +123,8 @@ def _require_same(out: Path, config) -> None:
     save_text(path, text)
 
 
-def _base(preset: Path, arguments: argparse.Namespace):
+def _base(preset: Path, arguments: argparse.Namespace) -> Run:
     """The run of the synthetic model: that of the folder given, else that of the experiment."""
-    from travjax.runs.preset import Preset
-    from travjax.runs.run import Run
-
     if not arguments.synthetic:
         return options.run_of(Preset.load(preset), arguments)
     for name, default in arguments.of_synthetic.items():
@@ -122,11 +133,8 @@ def _base(preset: Path, arguments: argparse.Namespace):
     return Run.load(arguments.synthetic)
 
 
-def _train_synthetic(base, folder: Path, devices) -> None:
+def _train_synthetic(base: Run, folder: Path, devices: Devices) -> None:
     """Trains and evaluates the synthetic model as far as that is not done."""
-    from travjax.training.evaluation_report import evaluate_run
-    from travjax.training.fit import fit
-
     fit(base, folder, devices, resume=True)
     if not (folder / TABLES).exists():
         evaluate_run(folder)
@@ -136,33 +144,21 @@ TABLES = "evaluation/tables.txt"
 """Tables of `travjax evaluate` in the folder of a training run."""
 
 
-def _data(sites: Path, given: Path | None, base, out: Path, stand_ins):
+def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: StandIns | None) -> Dataset:
     """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
-    from travjax.data import dataset
-    from travjax.runs.run import DATA
-
     if given:
         return dataset.load(given)
     put_back(out / DATA)
     if (out / DATA / "dataset.json").exists():
         return dataset.load(out / DATA)
-    from travjax.data.build import build_from_sites
-    from travjax.data.provenance import SitesConfig
-
     if stand_ins:
         stand_ins.write()
     config = stand_ins.sites if stand_ins else SitesConfig.load(sites)
     return build_from_sites(config, base.robot, base.actions, base.grid, out / DATA)
 
 
-def _write(transfer, results, out: Path, stand_ins) -> None:
+def _write(transfer: Transfer, results: Results, out: Path, stand_ins: StandIns | None) -> None:
     """Tables, figures, JSON and the report."""
-    from travjax.evaluation import map_figures
-    from travjax.evaluation.dataset_tables import statistics_table
-    from travjax.evaluation.simulator_benchmark import machine
-    from travjax.experiments.transfer_runs import IMAGENET
-    from travjax.experiments.transfer_scores import arms_table, events_table, results_json, transfer_figure
-
     config, base = transfer.config, transfer.base
     kind = "stand-in" if stand_ins else "real"
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
@@ -215,21 +211,15 @@ MEANING = (
 )
 
 
-def _samples(transfer) -> str:
+def _samples(transfer: Transfer) -> str:
     """What an epoch is trained on."""
-    from travjax.training.trajectory_samples import TrainingData
-
     if transfer.base.preset.model == FIELD:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
     return f"{TrainingData(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
-def _maps_figure(transfer):
+def _maps_figure(transfer: Transfer) -> Figure:
     """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
-    from travjax.evaluation import map_figures
-    from travjax.simulation.traverse import unpacked
-    from travjax.training.evaluator import Evaluator
-
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.from_run(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)

@@ -14,6 +14,7 @@ from travjax.data.dataset import Dataset
 from travjax.devices import Devices
 from travjax.evaluation import map_figures, score_figures
 from travjax.files import held, output_folder, put_back, user_path
+from travjax.jax_flags import usual_flags
 from travjax.models.input_images import render_inputs
 from travjax.models.names import RESNET
 from travjax.resnet.imagenet_weights import load_weights
@@ -26,7 +27,7 @@ from travjax.training.trainer import Trainer
 
 
 def run_from_preset(
-    preset: Preset,
+    preset: Preset | str | Path,
     *,
     robot: str | None = None,
     actions: str | Path | None = None,
@@ -37,11 +38,14 @@ def run_from_preset(
 ) -> Run:
     """Returns the run of a preset, with what is to differ from it.
 
+    preset:  a preset, or its TOML file
     robot, actions, size, spacing: as `load_setup` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
     seed:    of data set and training
-    Raises InputError when robot, action space and map do not fit together, and for a seed that cannot be.
+    Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
+    seed that cannot be.
     """
+    preset = preset if isinstance(preset, Preset) else Preset.load(preset)
     if weights:
         preset = replace(preset, weights=weights)
     if seed is not None:
@@ -53,6 +57,7 @@ def run_from_preset(
     return Run(preset, loaded, space, grid)
 
 
+@usual_flags()
 def fit(
     run: Run,
     folder: str | Path,
