@@ -8,6 +8,9 @@ from tests.commandline import FEW, files
 from tests.small_training import GRID, HUSKY, PRESET, TOML, copy, rows_of
 from travjax.config import InputError
 from travjax.runs.run import Run
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
 from travjax.training.fit import fit, run_from_preset
 
 pytestmark = pytest.mark.usefixtures("shared_code")
@@ -15,11 +18,7 @@ pytestmark = pytest.mark.usefixtures("shared_code")
 
 def test_the_run_of_a_preset_is_for_its_robot_and_the_paper_s_actions():
     run = run_from_preset(replace(PRESET, robot="seekur_jr"))
-    assert (run.robot, run.actions, run.grid) == (
-        travjax.Robot.load("seekur_jr"),
-        travjax.ActionSpace(),
-        travjax.Grid(),
-    )
+    assert (run.robot, run.actions, run.grid) == (Robot.load("seekur_jr"), ActionSpace(), Grid())
 
 
 def test_what_differs_from_the_preset_is_taken(tmp_path, few):

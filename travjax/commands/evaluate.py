@@ -38,7 +38,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Evaluates."""
+    """Evaluates a training run."""
     from travjax.training.evaluation_report import evaluate_run
 
     for name in ("maps", "each", "figure_maps"):

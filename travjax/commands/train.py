@@ -47,7 +47,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Trains."""
+    """Trains, alone or as one of several processes."""
     from travjax.devices import Devices, join
     from travjax.runs.preset import Preset
     from travjax.training.fit import fit

@@ -46,7 +46,7 @@ SEQUENTIAL = "sequential NumPy simulator"
 
 
 def machine() -> str:
-    """The device and versions that a figure belongs to, in one line."""
+    """Returns the device and versions that a figure belongs to, in one line."""
     device = jax.devices()[0]
     name = processor() if device.platform == "cpu" else device.device_kind
     versions = f"jax {jax.__version__}, Python {platform.python_version()}"
@@ -54,7 +54,7 @@ def machine() -> str:
 
 
 def processor() -> str:
-    """The name of the processor, or its kind where the system does not tell."""
+    """Returns the name of the processor, or its kind where the system does not tell."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -107,7 +107,7 @@ def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
 
 
 def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
-    """Terrain and labelling on compiled code, a row for each batch size."""
+    """Measures terrain and labelling on compiled code, a row for each batch size."""
     for maps in BATCHES:
         styles, seeds = _mixture(0, maps)
         make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
@@ -117,7 +117,7 @@ def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) ->
 
 
 def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
-    """Labelling of so many maps at once, on compiled code."""
+    """Measures labelling of so many maps at once, on compiled code."""
     heights = generate_terrain(*_mixture(0, maps), grid=grid)
     heights = heights[0] if maps == 1 else heights
     return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
@@ -126,7 +126,7 @@ def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, rep
 def reference_row(
     robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
 ) -> dict:
-    """One whole map by the sequential simulator, one trajectory after the other.
+    """Measures one whole map by the sequential simulator, one trajectory after the other.
 
     on_progress: is told how many trajectories of a call are done
     """
@@ -153,7 +153,7 @@ def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_pro
 
 
 def start_row() -> dict:
-    """A new process from its start to its end, one map labelled, the compilation cache filled by an earlier process."""
+    """Measures a new process that labels one map, the compilation cache filled by an earlier process."""
     seconds = []
     for _ in range(4):
         with tempfile.TemporaryDirectory() as folder:
@@ -167,14 +167,14 @@ def start_row() -> dict:
 
 
 def with_speed_up(rows: list[dict]) -> list[dict]:
-    """The rows with how many times faster than the sequential simulator each labels a map."""
+    """Returns the rows with how many times faster than the sequential simulator each labels a map."""
     sequential = next(row["ms_per_map"] for row in rows if row["what"] == SEQUENTIAL)
     simulates = lambda row: row["trajectories_per_s"] is not None
     return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
 
 
 def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
-    """One line for each row, the keys in `columns` and `machine` as header: this one, unless a row names its own."""
+    """Writes a line for each row under the keys in `columns` and `machine`: this one, unless a row names its own."""
     here = machine()
     cells = [
         [*("" if row[key] is None else str(row[key]) for key in columns), row.get("machine", here)] for row in rows

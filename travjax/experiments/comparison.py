@@ -54,7 +54,7 @@ SITES = Path("experiments/transfer/sites.toml")
 """The real ground unless another is given."""
 
 SEED = 20_251_125
-"""Of the test maps, the validation maps having the next one.
+"""The seed of the test maps; the validation maps have the next one.
 
 A data set draws its terrain seeds from its own seed and size together, so that maps of another seed or size are other
 maps. Presets have seed 0: none of their maps is among these, nor is a test map among the validation maps.
@@ -166,7 +166,7 @@ def _load(option: str, source: Path | None, model: str) -> Predictor:
 
 
 def _sites(given: Path | None, ground: str) -> SitesConfig | None:
-    """The sites to compare on; None, and a line that says why, where those of the experiment are not at hand."""
+    """Returns the sites to compare on, or says in a line why the experiment's are not at hand, and returns None."""
     if ground == SYNTHETIC:
         return None
     try:
@@ -188,7 +188,7 @@ def _synthetic(what: str, count: int, seed: int, field: Predictor) -> BenchmarkM
 
 
 def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict]:
-    """Rows of experiments/timing.py for the simulators and the ResNet50, and two for the hazard field."""
+    """Returns rows of experiments/timing.py for the simulators and the ResNet50, and two for the hazard field."""
     trained = field.run
     trunk = resnet.run.preset.trunk if resnet else ResNetConfig()
     rows = timing.measured(trained.robot, trained.actions, trained.grid, trunk, 64, repeats)
@@ -311,7 +311,7 @@ def _write(parts: Sequence[Part], out: Path) -> None:
 def _points(
     f1: Mapping[str, Mapping[str, float]], seconds: Mapping[str, float]
 ) -> dict[str, tuple[float, float, float]]:
-    """(seconds a map, F1 on clean maps, F1 at the largest noise) of each way.
+    """Returns (seconds a map, F1 on clean maps, F1 at the largest noise) of each way.
 
     The simulators are drawn with the best filter, the time of which is left out: without one they would look worse on
     the noisy map than they have to be.

@@ -43,14 +43,14 @@ IN_FIGURE = {
 """Methods of ON_SITES that the figure of real ground shows, and their names in it."""
 
 RECALL = 0.97
-"""For which a threshold is chosen on validation maps."""
+"""The recall for which a threshold is chosen on validation maps."""
 
 SiteScores = dict[str, dict[str, dict[str, Confusion]]]
-"""Of one site: by corruption, method and event."""
+"""Confusions of one site: by corruption, method and event."""
 
 
 def best_filters(validation: BenchmarkMaps, seed: int) -> dict[str, str]:
-    """For every corruption the filter of FILTERS after which the simulator is best on the validation maps."""
+    """Returns for every corruption the filter after which the simulator is best on the validation maps."""
     with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
         return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
 
@@ -64,7 +64,7 @@ def compare(
     chosen: Mapping[str, str],
     seed: int,
 ) -> dict:
-    """For every corruption: the filter chosen for it, and for every method its confusions and average precisions."""
+    """Returns for every corruption its filter, and every method's confusions and average precisions."""
     results: dict[str, dict] = {}
     drawn = _drawn(test, samples, seed)
     methods = 3 + (resnet is not None)
@@ -95,7 +95,7 @@ def _margins(margins: np.ndarray | None) -> np.ndarray:
 
 
 def _drawn(test: BenchmarkMaps, samples: int, seed: int) -> Samples:
-    """Random trajectories of all maps, for what is too slow for all of them."""
+    """Draws random trajectories of all maps, for what is too slow for all of them."""
     rng = np.random.default_rng(seed)
     maps, trajectories = test.failed.shape[:2]
     places = np.sort(rng.choice(maps * trajectories, min(samples, maps * trajectories), replace=False))
@@ -107,7 +107,7 @@ def _scored(fails: np.ndarray, failed: np.ndarray) -> dict:
 
 
 def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predictor, predicted: Predicted) -> dict:
-    """The threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
+    """Returns the threshold for RECALL, chosen on validation maps, and the errors of the margins [m, m, rad]."""
     probability = field.predict(validation.heights).probability
     threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
     largest = LARGE_MARGIN * np.asarray(test.robot.limits)
@@ -120,7 +120,7 @@ def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predic
 
 
 def on_sites(real: Mapping[str, BenchmarkMaps], field: Predictor, seed: int) -> dict[str, SiteScores]:
-    """For every site and corruption: the confusions of the simulator after each filter, and of the hazard field."""
+    """Returns by site and corruption the confusions of the simulator after each filter, and of the hazard field."""
     with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
         return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
 
@@ -141,7 +141,7 @@ def _of_site(ground: BenchmarkMaps, field: Predictor, seed: int, on_progress: Pr
 
 
 def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
-    """F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
+    """Returns F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
     return {
         method: {name: one["methods"][method]["confusion"][OVERALL].f1 for name, one in results.items()}
         for method in METHODS
@@ -150,13 +150,13 @@ def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
 
 
 def f1_of_site(site: SiteScores, chosen: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: of each corruption the filter."""
+    """Returns F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: each one's filter."""
     f1 = {method: {name: of[method][OVERALL].f1 for name, of in site.items()} for method in ON_SITES}
     return f1 | {FILTERED: {name: f1[smooth][name] for name, smooth in chosen.items()}}
 
 
 def shown(value: float) -> str:
-    """A share with three digits, or a dash where it is undefined."""
+    """Shows a share with three digits, or a dash where it is undefined."""
     return "-" if math.isnan(value) else f"{value:.3f}"
 
 
@@ -164,7 +164,7 @@ QUALITY = {"method": "clean maps", "event": "", "recall": "recall", "precision":
 
 
 def quality_table(clean: dict) -> str:
-    """Recall, precision, F1 and average precision of each method and event on the clean maps."""
+    """Returns a table of recall, precision, F1 and average precision of each method and event on the clean maps."""
     rows = []
     for method, scored in clean["methods"].items():
         if method == FILTERED:
@@ -184,7 +184,7 @@ def _quality(method: str, event: str, confusion: Confusion, precision: float) ->
 
 
 def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> str:
-    """F1 of every method on real ground: for each corruption a row a site; below it filters and who is ahead.
+    """Returns a table of F1 on real ground: for each corruption a row a site; below it filters and who is ahead.
 
     sites: scores by name; chosen: of each corruption the filter of FILTERED
     """
@@ -204,7 +204,7 @@ def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> s
 
 
 def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """One line: on how many sites the field is above the simulator after the best filter; f1: by site and method."""
+    """Says on how many sites the field is above the simulator after the best filter; f1: by site and method."""
     counts = []
     for name in CORRUPTIONS:
         measured = [of for of in f1.values() if not math.isnan(of[HAZARD][name])]
@@ -214,7 +214,7 @@ def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 
 def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
-    """F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
+    """Draws F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
 
     f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
     """
@@ -244,7 +244,7 @@ OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
 
 
 def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
-    """F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
+    """Draws F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
 
     f1:      by site, method and corruption: "none", "noise 2 cm", or another
     methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
@@ -276,7 +276,7 @@ def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: M
 
 
 def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
-    """F1 against the time for all trajectories of a map.
+    """Draws F1 against the time for all trajectories of a map.
 
     points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
     """

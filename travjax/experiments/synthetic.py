@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:
-    """Of the report."""
+    """Returns texts and figures of the report."""
     epochs = [row for row in read_rows(folder / "metrics.jsonl") if type(row.get("samples_per_s")) in (int, float)]
     steps = [f"{row['step']:,} steps, {row['samples_per_s']:,.0f} samples/s in the last epoch" for row in epochs[-1:]]
     trained = (
@@ -88,7 +88,7 @@ def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]
 
 
 def _beside_the_paper(wanted: Run, ours: Confusion) -> list[str]:
-    """One line over all events, if robot and action space are the paper's."""
+    """Returns one line over all events, if robot and action space are the paper's."""
     if not as_in_paper(wanted.robot, wanted.actions):
         return []
     shown = lambda value: "-" if math.isnan(value) else f"{value:.3f}"

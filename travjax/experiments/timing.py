@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 def measured(
     robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
 ) -> list[dict]:
-    """A row for each way to all trajectories of a map, on the device at hand, with progress bars."""
+    """Measures each way to all trajectories of a map on the device at hand, with progress bars; returns the rows."""
     with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
         row = simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
@@ -115,7 +115,7 @@ def measured(
 
 
 def _of_paper() -> list[dict]:
-    """What the paper says."""
+    """Returns rows of what the paper says."""
     sequential = next(seconds for _, seconds in PAPER.values())
     trajectories = len(ActionSpace())
     return [
@@ -136,7 +136,7 @@ def _row(what: str, device: str, seconds: float, trajectories: int, sequential: 
 
 
 def _device() -> str:
-    """What JAX runs on."""
+    """Names what JAX runs on."""
     devices = jax.devices()
     if devices[0].platform == "cpu":
         return f"{simulator_benchmark.processor()}, {os.cpu_count()} cores"

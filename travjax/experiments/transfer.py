@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
-    """The experiment of a preset in a folder that no other process uses."""
+    """Runs the experiment of a preset in a folder that no other process uses."""
     config = load_toml(path, TransferConfig)
     sites = path.parent / user_path(config.sites)
     stand_ins = chosen_stand_ins(sites, out, arguments.stand_ins, arguments.data)
@@ -124,7 +124,7 @@ def _require_same(out: Path, config: TransferConfig) -> None:
 
 
 def _base(preset: Path, arguments: argparse.Namespace) -> Run:
-    """The run of the synthetic model: that of the folder given, else that of the experiment."""
+    """Returns the run of the synthetic model: that of the folder given, else that of the experiment."""
     if not arguments.synthetic:
         return options.run_of(Preset.load(preset), arguments)
     for name, default in arguments.of_synthetic.items():
@@ -145,7 +145,7 @@ TABLES = "evaluation/tables.txt"
 
 
 def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: StandIns | None) -> Dataset:
-    """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
+    """Returns the data set of real maps: the one given, else the experiment's, made if it is not there yet."""
     if given:
         return dataset.load(given)
     put_back(out / DATA)
@@ -158,7 +158,7 @@ def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: Stan
 
 
 def _write(transfer: Transfer, results: Results, out: Path, stand_ins: StandIns | None) -> None:
-    """Tables, figures, JSON and the report."""
+    """Prints tables, and writes figures, JSON and the report."""
     config, base = transfer.config, transfer.base
     kind = "stand-in" if stand_ins else "real"
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
@@ -212,14 +212,14 @@ MEANING = (
 
 
 def _samples(transfer: Transfer) -> str:
-    """What an epoch is trained on."""
+    """Says what an epoch is trained on."""
     if transfer.base.preset.model == FIELD:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
     return f"{TrainingData(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
 def _maps_figure(transfer: Transfer) -> Figure:
-    """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
+    """Draws the synthetic model before and after training on real maps, over the truth, on windows of one site."""
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.from_run(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)

@@ -40,7 +40,7 @@ FIELD_ARMS = (SCRATCH, "synthetic")
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """The experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
+    """Describes the experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
 
     sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
     synthetic:  preset that trains the synthetic model
@@ -86,7 +86,7 @@ class TransferConfig:
 
 
 class Transfer:
-    """The runs of all arms, in a folder.
+    """Trains the runs of all arms, in a folder.
 
     base:      the synthetic model's run; synthetic: its folder, which is read when its arm begins
     held_out:  samples of the test maps of each site, at natural frequency
@@ -200,7 +200,7 @@ class Transfer:
 
 
 def _kept_features(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file of features; none where there is no file or it is damaged, since they can be made anew."""
+    """Returns the arrays of a file of features, none where it is missing or damaged: they can be made anew."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return dict(file)
@@ -213,7 +213,7 @@ def _name(arm: str) -> str:
 
 
 def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
-    """Samples of the test maps of each site."""
+    """Returns samples of the test maps of each site."""
     test = dataset.maps_of("test")
     require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
     sites = list(dict.fromkeys(dataset.group[test].tolist()))
@@ -223,7 +223,7 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
 
 
 def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
-    """The rows of all runs by arm and seed, those of one seed after the other; on_run is told which one begins."""
+    """Returns the rows of all runs by arm and seed, trained one after the other; on_run is told which one begins."""
     results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
     for arm in transfer.arms:
         for seed in transfer.config.seeds:

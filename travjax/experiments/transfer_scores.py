@@ -29,7 +29,7 @@ PAPER_BEST = {
 COUNTS = ("tn", "fp", "fn", "tp")
 
 Confusions = dict[str, dict[str, Confusion]]
-"""By site, ALL among them, and by event, "overall" among them."""
+"""Confusions by site, ALL among them, and by event, "overall" among them."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Epoch:
 
     @staticmethod
     def from_row(row: Mapping) -> "Epoch":
-        """From a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
+        """Reads a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
         allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
         require(_is_scored(row), "row of metrics.jsonl", row, allowed)
         sites = {
@@ -60,7 +60,7 @@ class Epoch:
 
 
 def _is_scored(row: Mapping) -> bool:
-    """Whether a row of metrics.jsonl holds counts of every event on each site, and a number from validation if any."""
+    """Tells whether a row holds counts of every event on each site, and a number from validation if any."""
     at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
     sites, precision = row.get("watched"), row.get("average_precision")
     if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
@@ -80,17 +80,17 @@ class ArmRun:
     epochs: tuple[Epoch, ...]
 
     def best(self, site: str) -> Epoch:
-        """The epoch of the largest F1, events pooled, on a held-out site: the paper's way, which looks at the test."""
+        """Returns the epoch of the largest pooled F1 on a held-out site: the paper's way, which looks at the test."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.held_out[site][OVERALL].f1))
 
     @property
     def chosen(self) -> Epoch:
-        """The epoch that is best on the validation windows, by average precision; its checkpoint is the run's best."""
+        """Returns the epoch of the best average precision on validation windows, whose checkpoint is the run's best."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.validation))
 
 
 def always_fails(counts: Confusion) -> Confusion:
-    """Of the predictor that says "fails" of every trajectory, on the samples of these counts."""
+    """Returns the counts of the predictor that says "fails" of every trajectory, on the same samples."""
     return Confusion(0, counts.tn + counts.fp, 0, counts.fn + counts.tp)
 
 
@@ -106,39 +106,39 @@ class Results:
 
     @staticmethod
     def from_rows(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
-        """From the rows of every arm and seed."""
+        """Reads the rows of every arm and seed."""
         run = lambda part: ArmRun(tuple(Epoch.from_row(row) for row in part))
         return Results({arm: {seed: run(part) for seed, part in seeds.items()} for arm, seeds in rows.items()})
 
     @cached_property
     def _some(self) -> Confusions:
-        """Of any run: how many samples fail is the same in all."""
+        """Returns those of any run: how many samples fail is the same in all."""
         return next(iter(next(iter(self.arms.values())).values())).epochs[0].held_out
 
     @property
     def sites(self) -> list[str]:
-        """The held-out sites, and ALL if they are several."""
+        """Returns the held-out sites, and ALL if they are several."""
         return list(self._some)
 
     def always(self, site: str, event: str = OVERALL) -> Confusion:
-        """The predictor that says "fails" of every trajectory."""
+        """Returns the counts of the predictor that says "fails" of every trajectory."""
         return always_fails(self._some[site][event])
 
     def f1(self, arm: str, site: str) -> np.ndarray:
-        """F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
+        """Returns F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
         runs = self.arms[arm].values()
         return np.array([[epoch.held_out[site][OVERALL].f1 for epoch in run.epochs] for run in runs])
 
     def best(self, arm: str, site: str) -> list[Epoch]:
-        """The best epoch of each seed on a held-out site."""
+        """Returns the best epoch of each seed on a held-out site."""
         return [run.best(site) for run in self.arms[arm].values()]
 
     def chosen(self, arm: str) -> list[Epoch]:
-        """The epoch of each seed that is best on the validation windows."""
+        """Returns the epoch of each seed that is best on the validation windows."""
         return [run.chosen for run in self.arms[arm].values()]
 
     def first(self, arm: str) -> list[Epoch]:
-        """The first state of each seed."""
+        """Returns the first state of each seed."""
         return [run.epochs[0] for run in self.arms[arm].values()]
 
 
@@ -158,7 +158,7 @@ ARM_COLUMNS = {
 
 
 def arms_table(results: Results) -> str:
-    """For each held-out site: the predictor that always says "fails", each arm at its two epochs, and the paper's."""
+    """Returns a table: for each site the predictor "always fails", each arm at its two epochs, and the paper's."""
     rows: list[dict] = []
     for site in results.sites:
         always = results.always(site)
@@ -193,7 +193,7 @@ EVENT_COLUMNS = {
 
 
 def events_table(results: Results, arm: str) -> str:
-    """For each held-out site and event an arm untrained, at its best epoch and at validation's; the paper's below."""
+    """Returns a table: for each site and event an arm untrained, at its best and at validation's epoch; the paper's."""
     rows = []
     for site in results.sites:
         states = {"untrained": results.first(arm), "best epoch": results.best(arm, site)}
@@ -229,7 +229,7 @@ def _numbers(epochs: Iterable[Epoch]) -> str:
 
 
 def mean_and_spread(values: Sequence[float]) -> str:
-    """Mean and standard deviation of the seeds; a dash where a value is undefined."""
+    """Returns mean and standard deviation of the seeds; a dash where a value is undefined."""
     if any(math.isnan(value) for value in values):
         return "-"
     spread = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 and np.ptp(values) > 0 else ""
@@ -237,7 +237,7 @@ def mean_and_spread(values: Sequence[float]) -> str:
 
 
 def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
-    """Why figures of some events and sites in the rows of a table are a dash."""
+    """Says why figures of some events and sites in the rows of a table are a dash."""
     none = [
         f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
         for site in results.sites
@@ -249,7 +249,7 @@ def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
 
 
 def results_json(results: Results) -> dict:
-    """Everything, for results.json."""
+    """Returns everything, for results.json."""
 
     def run(one: ArmRun) -> dict:
         best = {site: one.best(site).number for site in results.sites}
@@ -261,7 +261,7 @@ def results_json(results: Results) -> dict:
 
 
 def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
-    """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+    """Draws F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
 
     arms: their colours; maps: what they are trained on
     Epoch 0 is the first state; the dashed line is the predictor that always says "fails".

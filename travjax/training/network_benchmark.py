@@ -61,7 +61,7 @@ class Bench:
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
-        """One row for each thing that is measured."""
+        """Yields one row for each thing that is measured."""
         yield self.inputs()
         yield self.training_step()
         try:
@@ -155,14 +155,14 @@ def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, rep
 
 
 def with_ratio(rows: list[dict]) -> list[dict]:
-    """The rows, the Flax step's with its time as a multiple of PyTorch's if that was measured."""
+    """Returns the rows, the Flax step's with its time as a multiple of PyTorch's if that was measured."""
     ms = {row["what"]: row["ms"] for row in rows}
     ratio = ms[FLAX] / ms[TORCH] if TORCH in ms else None
     return [row | {"ratio": ratio if row["what"] == FLAX else None} for row in rows]
 
 
 def torch_estimator():
-    """The estimator in PyTorch: (trunk, heads), for images in channels-last form."""
+    """Makes the estimator in PyTorch: (trunk, heads), for images in channels-last form."""
     import torch
     from torch import nn
 
@@ -197,7 +197,7 @@ def torch_estimator():
 
 
 def _torch_training(grid: Grid) -> Callable[[], object]:
-    """A training step of the PyTorch estimator on a fixed batch of random images."""
+    """Makes a training step of the PyTorch estimator on a fixed batch of random images."""
     import torch
     from torch import nn
 
