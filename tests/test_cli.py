@@ -18,9 +18,9 @@ from PIL import Image
 import travjax
 from tests.commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 from travjax import cli
-from travjax.commands import label as label_command
 from travjax.config import to_json
 from travjax.data import map_batches
+from travjax.evaluation import map_reports
 from travjax.evaluation.tables import shares_table
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -624,7 +624,7 @@ def test_an_interruption_is_one_line_and_leaves_nothing_half_written(tmp_path, f
     def interrupt(*arguments, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(label_command.NpzStream, "save", interrupt)
+    monkeypatch.setattr(map_reports.NpzStream, "save", interrupt)
     done = run(tmp_path, "label", "--count", 1, "--actions", few, "--no-figures")
     assert done.code == 130
     assert done.err.splitlines()[-1] == "travjax: interrupted"

@@ -1,5 +1,6 @@
 """A module of travjax imports only modules below it: of a package further down, or of its own further down."""
 
+import argparse
 import ast
 from pathlib import Path
 
@@ -8,36 +9,40 @@ import pytest
 import travjax
 
 LAYERS = {
-    "": "config signals locks files progress jax_flags batching devices entry",
-    "simulation": "arrays grid heights events robot actions footprint traverse reference",
+    "": "config signals locks memory files npz_stream progress jax_flags batching devices",
+    "simulation": "arrays grid heights events robot actions footprint setup traverse reference",
     "terrain": "noise landforms rock_field styles",
-    "rasters": "coordinates reading_options memory formats raster gdal_files array_files holes surface",
+    "rasters": "coordinates reading_options formats raster gdal_files array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
-    "data": "dem map_batches npz_stream sensor_noise sampling provenance dataset_json dataset sites tfds_export",
+    "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
     "fetched_weights",
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
-    "evaluation": "metrics baselines map_figures tables transfer_scores score_figures dataset_tables "
-    "simulator_benchmark",
+    "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
-    "runs": "quiet_orbax checkpoint run_log run model_file predictor evaluator",
-    "training": "step trainer network_benchmark",
-    "commands": "options terrain label dataset weights train evaluate export predict bench",
-    "experiments": "launch transfer_runs stand_ins robustness robustness_scores synthetic transfer timing comparison",
+    "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
+    "training": "step trainer fit evaluation_report network_benchmark",
+    "programs": "entry options",
+    "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
+    "timing comparison",
+    "commands": "terrain label dataset weights train evaluate export predict bench",
     "program": "cli",
 }
-"""Packages from the bottom to the top, "" and "program" being travjax itself; in each, its modules likewise."""
+"""Packages from the bottom to the top, those of TOP being travjax itself; in each, its modules likewise."""
+
+TOP = ("", "programs", "program")
+"""Layers of modules that lie in no package."""
 
 MOST = 10
 """Modules in a package."""
 
 ORDER = [
-    f"{package}.{module}" if package not in ("", "program") else module
+    f"{package}.{module}" if package not in TOP else module
     for package, modules in LAYERS.items()
     for module in modules.split()
 ]
-FREE = ["__init__", "__main__", *(f"{package}.__init__" for package in LAYERS if package not in ("", "program"))]
-PACKAGES = ["travjax", *(f"travjax.{package}" for package in LAYERS if package)]
+FREE = ["__init__", "__main__", *(f"{package}.__init__" for package in LAYERS if package not in TOP)]
+PACKAGES = ["travjax", *(f"travjax.{package}" for package in LAYERS if package not in TOP)]
 PACKAGE = Path(travjax.__file__).parent
 MODULES = sorted(".".join(path.relative_to(PACKAGE).with_suffix("").parts) for path in PACKAGE.rglob("*.py"))
 
@@ -98,3 +103,58 @@ def test_the_sequential_simulator_shares_no_code_with_the_package():
 
 def test_modules_are_found_at_all():
     assert {"config", "simulation.reference", "simulation.traverse", "__init__"} <= set(MODULES)
+
+
+# ---- Commands parse, call and print; the library and the experiments do without them
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if module != "cli"])
+def test_only_the_command_line_imports_commands(module):
+    imported = imports_of((PACKAGE / f"{module.replace('.', '/')}.py").read_text())
+    assert [name for name in imported if name.split(".")[0] == "commands"] == []
+
+
+def misused(source: str) -> list[str]:
+    """What of argparse a module should leave alone: private attributes, and namespaces that are built by hand."""
+    tree = ast.parse(source)
+    if not any(
+        "argparse" in ast.unparse(node) for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)
+    ):
+        return []
+    parser = argparse.ArgumentParser()
+    private = {
+        name
+        for thing in (argparse, parser, parser.add_subparsers(), parser.add_argument_group())
+        for name in dir(thing)
+        if name.startswith("_") and not name.startswith("__")
+    }
+    called = [ast.unparse(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    read = [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    named = [alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    namespaces = [name for name in called if name.split(".")[-1] == "Namespace"]
+    return namespaces + [name for name in read + named if name in private]
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("def f(arguments: argparse.Namespace): return arguments.out", []),
+        ("argparse.Namespace(out=1)", ["argparse.Namespace"]),
+        ("from argparse import Namespace\nNamespace(**vars(given))", ["Namespace"]),
+        ("from argparse import _SubParsersAction", ["_SubParsersAction"]),
+        ("Commands = argparse._SubParsersAction", ["_SubParsersAction"]),
+        ("for action in group._group_actions: pass", ["_group_actions"]),
+        ("self._parser.parse_args(), self.__doc__", []),
+    ],
+)
+def test_misuse_of_argparse_is_found(source, expected):
+    assert misused(f"import argparse\n{source}") == expected
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_no_module_builds_namespaces_or_reads_what_is_private_to_argparse(module):
+    assert misused((PACKAGE / f"{module.replace('.', '/')}.py").read_text()) == []
+
+
+def test_no_public_name_is_that_of_a_module_which_would_hide_it():
+    assert set(travjax.__all__) & {name.split(".")[0] for name in MODULES} == set()

@@ -19,8 +19,8 @@ from travjax.data.dataset import Dataset, is_dataset, load, save
 from travjax.data.provenance import SiteRecord, SitesConfig
 from travjax.estimators.preset import Preset, TrainingConfig
 from travjax.evaluation.dataset_tables import statistics_table, windows_table
-from travjax.evaluation.transfer_scores import Epoch
 from travjax.experiments.transfer_runs import TransferConfig
+from travjax.experiments.transfer_scores import Epoch
 from travjax.runs.run import Run, checked_meta
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid

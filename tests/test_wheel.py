@@ -120,7 +120,7 @@ from travjax.config import load_toml
 from travjax.data.provenance import SitesConfig
 from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
-from travjax.runs.preset import Preset
+from travjax.estimators.preset import Preset
 
 kinds = {{"sites": SitesConfig, "transfer": TransferConfig}}
 for kind, name in {names}:

@@ -3,6 +3,12 @@
     heights = travjax.generate_terrain("rough", range(32))   # or travjax.load_dem("site.tif").heights
     margins = travjax.simulate(heights)                      # step, obstacle, tilt margins of 3042 trajectories a map
     failed = travjax.label(heights)                          # [32, 3042, 3]
+    probability = travjax.predict(heights)                   # likewise, by the hazard field that comes with it
+
+    run = travjax.run_from_preset("mine.toml")               # what an estimator of one's own is made from
+    travjax.fit(run, "runs/mine")                            # trains it, in a folder
+    scores = travjax.evaluate_run("runs/mine")               # tables and figures of its test maps
+    predictor = travjax.Predictor.load("runs/mine")          # predictor.predict(heights).probability
 
 Arrays, frames and units are in the module docstrings: grid.py for maps, actions.py for trajectories, traverse.py for
 margins and failures.

@@ -1,15 +1,19 @@
 """The public names and where they come from; __init__.py reads this file."""
 
 from .config import InputError
+from .data.dataset import load_dataset
 from .data.dem import load_dem
 from .models.input_images import render_inputs
-from .runs.predictor import predict
+from .runs.predictor import Predictor, predict
+from .runs.run import load_estimator
 from .simulation.actions import ActionSpace
 from .simulation.events import EVENTS, Margins
 from .simulation.grid import Grid
 from .simulation.robot import Robot
 from .simulation.traverse import failures, label, simulate
 from .terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
+from .training.evaluation_report import evaluate_run
+from .training.fit import fit, run_from_preset
 
 __version__: str
 
@@ -20,15 +24,21 @@ __all__ = [
     "Grid",
     "InputError",
     "Margins",
+    "Predictor",
     "Robot",
     "TerrainParams",
     "elevation",
+    "evaluate_run",
     "failures",
+    "fit",
     "generate_terrain",
     "label",
+    "load_dataset",
     "load_dem",
+    "load_estimator",
     "predict",
     "render_inputs",
+    "run_from_preset",
     "sample_params",
     "simulate",
 ]

@@ -1,4 +1,4 @@
-"""The command `travjax`; commands/ does the work, and entry.py says what is wrong with bad input."""
+"""The command `travjax`; commands/ holds what it can do, and entry.py says what is wrong with bad input."""
 
 import argparse
 from collections.abc import Sequence

@@ -46,7 +46,7 @@ def settle_streams() -> None:
 
 
 def _settled(stream: IO[str] | None, number: int) -> IO[str]:
-    """The stream, or one in place of none; it escapes letters of file names that its encoding lacks."""
+    """Returns the stream, or one in place of none; it escapes letters of file names that its encoding lacks."""
     stream = stream or open(number, "w", closefd=False)
     if hasattr(stream, "reconfigure"):  # not that of a test
         stream.reconfigure(errors="backslashreplace")
@@ -97,14 +97,14 @@ def _drop_output() -> None:
 
 
 def _out_of_memory(error: MemoryError | RuntimeError) -> str:
-    """One line; the error's first note, of `config.naming`, says what was read or made."""
+    """Returns one line; the error's first note, of `config.naming`, says what was read or made."""
     what = "".join(f"{note}: " for note in getattr(error, "__notes__", [])[:1])
     reason = str(error).partition("\n")[0][:200]
     return f"{what}out of memory{reason and ': '}{reason}; try fewer maps or a smaller batch_size"
 
 
 def use_compilation_cache() -> None:
-    """Compiled code is kept between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
+    """Keeps compiled code between runs, so that a second start is quick; JAX_COMPILATION_CACHE_DIR moves it."""
     import jax
 
     cache, moved = cache_folder(), "JAX_COMPILATION_CACHE_DIR" in os.environ
@@ -123,7 +123,7 @@ def use_compilation_cache() -> None:
 
 
 def _give_matplotlib_a_folder() -> None:
-    """Without a home it ends in a traceback, and it says much of one that cannot be written to."""
+    """Gives it a folder, since it fails without a home and says much of one that cannot be written to."""
     if "MPLCONFIGDIR" not in os.environ:
         os.environ["MPLCONFIGDIR"] = tempfile.mkdtemp(prefix="travjax-matplotlib-")
         atexit.register(shutil.rmtree, os.environ["MPLCONFIGDIR"], ignore_errors=True)

@@ -13,7 +13,7 @@ import pytest
 from tests.commandline import FEW, Run, files, printed_files, run, run_words, succeeds
 from travjax import cli
 from travjax.commands import dataset as command
-from travjax.data import dataset, sites, tfds_export
+from travjax.data import build, dataset, sites, tfds_export
 from travjax.data.dataset import ARRAYS, DatasetConfig, generate, load
 from travjax.data.provenance import Site, SitesConfig
 from travjax.data.sampling import balanced_subset
@@ -370,7 +370,7 @@ def test_bad_input_is_one_line_with_exit_code_2_and_nothing_written(tmp_path, na
 
 @pytest.mark.parametrize("below", ["", "sub", "sub/sub"])
 def test_a_file_in_the_way_of_the_output_is_one_line_before_anything_is_made(tmp_path, below, monkeypatch):
-    monkeypatch.setattr(command, "generate", lambda *_: pytest.fail("made for nothing"))
+    monkeypatch.setattr(build, "generate", lambda *_: pytest.fail("made for nothing"))
     (tmp_path / "taken").write_text("mine")
     done = run(tmp_path / "taken" / below, "dataset", "--maps", 2)
     assert done.code == 2
@@ -390,7 +390,7 @@ def test_the_working_folder_is_not_replaced(tmp_path, monkeypatch):
 
 
 def test_a_folder_of_something_else_is_left_alone_before_anything_is_made(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "generate", lambda *_: pytest.fail("made for nothing"))
+    monkeypatch.setattr(build, "generate", lambda *_: pytest.fail("made for nothing"))
     (tmp_path / "thesis.txt").write_text("mine")
     done = run(tmp_path, "dataset", "--maps", 2)
     assert done.code == 2
@@ -400,7 +400,7 @@ def test_a_folder_of_something_else_is_left_alone_before_anything_is_made(tmp_pa
 
 @pytest.mark.parametrize("text", ["mine\n", ""])
 def test_a_file_of_the_user_s_is_not_replaced_by_the_statistics(tmp_path, monkeypatch, text):
-    monkeypatch.setattr(command, "generate", None)  # not reached
+    monkeypatch.setattr(build, "generate", None)  # not reached
     notes = tmp_path / "set_statistics.txt"
     notes.write_text(text)
     done = run(tmp_path / "set", *WORDS)
@@ -434,7 +434,7 @@ def test_too_many_maps_for_the_memory_are_said_so(tmp_path, few, monkeypatch):
     def exhausted(*_):
         raise MemoryError("Unable to allocate 620. GiB")
 
-    monkeypatch.setattr(command, "generate", exhausted)
+    monkeypatch.setattr(build, "generate", exhausted)
     done = run(tmp_path / "set", "dataset", "--maps", 9_999_999, *SMALL, "--actions", few)
     assert done.code == 2
     assert done.err.splitlines()[-1].endswith("--maps = 9999999: do not fit in memory: Unable to allocate 620. GiB")
@@ -445,7 +445,7 @@ def test_an_interruption_leaves_the_data_set_that_was_there(copied, few, monkeyp
     def interrupt(dataset, folder, on_progress):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "save", interrupt)
+    monkeypatch.setattr(build, "save", interrupt)
     before = files(copied.parent)
     done = run(copied, "dataset", "--maps", 2, *SMALL, "--actions", few)
     assert done.code == 130

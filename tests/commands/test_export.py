@@ -10,9 +10,9 @@ import pytest
 from tests.commandline import FEW, files, run_words
 from tests.field_runs import CONFIG
 from tests.small_training import copy, dataset, host, require_equal
-from travjax.commands.export import card
 from travjax.models.variables import split_model
 from travjax.runs.checkpoint import load_meta
+from travjax.runs.model_card import card
 from travjax.runs.model_file import read_model
 from travjax.runs.predictor import DEFAULT, WEIGHTS, Predictor
 from travjax.runs.run import load_estimator

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from travjax.models.names import MODELS
 
 from tests.small_training import PRESET, TOML
 from travjax.config import InputError, from_json, one_line, to_json
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
+from travjax.estimators.names import ESTIMATORS
 from travjax.estimators.preset import IMAGENET_WEIGHTS, EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.files import PRESETS
 from travjax.models.hazard_field import FieldConfig
@@ -21,7 +21,7 @@ from travjax.resnet.fetched_weights import KEPT
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.actions import ActionSpace
 
-RESNETS, FIELDS = (sorted((PRESETS / model).glob("*.toml")) for model in MODELS)
+RESNETS, FIELDS = (sorted((PRESETS / model).glob("*.toml")) for model in ESTIMATORS)
 
 FIELD_TOML = """
 model = "field"

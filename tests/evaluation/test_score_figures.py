@@ -5,10 +5,8 @@ import pytest
 from matplotlib.colors import same_color
 
 from tests.evaluation.test_map_figures import colours, pixels, within
-from tests.evaluation.test_transfer_scores import results
 from travjax.evaluation import score_figures
 from travjax.evaluation.metrics import NAMES, PAPER_REAL, PAPER_SYNTHETIC, Evaluation, evaluate
-from travjax.evaluation.transfer_scores import Results
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 
@@ -230,26 +228,3 @@ def test_a_flat_map_draws(tmp_path):
 def test_every_name_has_a_colour_of_its_own():
     used = [*score_figures.COLOURS, "black", *score_figures.BASELINES]
     assert not any(same_color(one, other) for k, one in enumerate(used) for other in used[:k])
-
-
-# ---- The transfer experiment
-
-
-def test_the_f1_of_each_arm_is_drawn_with_the_band_of_its_seeds_and_the_predictor_that_always_fails(tmp_path):
-    rows = results().arms["random"]
-    made = Results({"random": rows, "ImageNet": {0: rows[1]}})
-    figure = score_figures.transfer_figure(made, {"random": "tab:gray", "ImageNet": "tab:blue"})
-    image = pixels(figure, tmp_path)
-    assert [ax.get_title().split(":")[0] for ax in figure.axes] == made.sites
-    for ax, site in zip(figure.axes, made.sites, strict=True):
-        drawn = labelled_lines(ax)
-        f1 = made.f1("random", site)
-        np.testing.assert_allclose(drawn["random"], ([0, 1, 2], f1.mean(axis=0)))
-        np.testing.assert_allclose(drawn["ImageNet"][1], f1[1])
-        assert set(drawn["always fails"][1]) == {made.always(site).f1}
-        band = ax.collections[0].get_paths()[0].vertices
-        for epoch in range(3):
-            edges = band[band[:, 0] == epoch, 1]
-            assert (edges.min(), edges.max()) == pytest.approx((f1[:, epoch].min(), f1[:, epoch].max()))
-        assert colours(within(ax, image)) > 20
-    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [*made.arms, "always fails"]

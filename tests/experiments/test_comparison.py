@@ -8,15 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from travjax.models.names import MODELS
 
 from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY
 from travjax.data.dataset import DatasetConfig
 from travjax.data.provenance import SitesConfig
+from travjax.estimators.names import ESTIMATORS
 from travjax.estimators.preset import Preset
-from travjax.evaluation import score_figures
 from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.experiments import comparison
 from travjax.experiments.robustness import CORRUPTIONS, FILTERS, BenchmarkMaps, of_sites
@@ -27,6 +26,9 @@ from travjax.experiments.robustness_scores import (
     SIMULATOR,
     best_filters,
     compare,
+    quality_figure,
+    robustness_figure,
+    sites_figure,
     sites_table,
 )
 from travjax.files import PRESETS
@@ -135,7 +137,7 @@ def test_the_report_says_what_the_scores_are_of(done):
 
 
 def test_maps_are_those_of_no_preset():
-    presets = [Preset.load(path) for model in MODELS for path in (PRESETS / model).glob("*.toml")]
+    presets = [Preset.load(path) for model in ESTIMATORS for path in (PRESETS / model).glob("*.toml")]
     sets = [DatasetConfig(200, comparison.SEED), DatasetConfig(50, comparison.SEED + 1)]
     ours, others = (
         [set(zip(config.styles().tolist(), config.seeds().tolist(), strict=True)) for config in configs]
@@ -161,7 +163,7 @@ def test_the_quality_figure_draws_the_simulator_after_its_filter():
     seconds = {"sequential simulator": 3.0, "network, float32, batches of 64": 30.0, "hazard field, 1 map": 0.05}
     points = comparison._points(f1, seconds)
     assert points == {"sequential simulator": (3.0, 1.0, 0.8), "hazard field, 1 map": (0.05, 0.9, 0.85)}
-    (ax,) = score_figures.quality_figure(points).axes
+    (ax,) = quality_figure(points).axes
     assert ax.get_xscale() == "log"
     drawn = {(*line.get_xdata(), *line.get_ydata()) for line in ax.lines if line.get_marker() in "ov"}
     assert {(3.0, 1.0), (3.0, 0.8), (0.05, 0.9), (0.05, 0.85)} <= drawn
@@ -169,7 +171,7 @@ def test_the_quality_figure_draws_the_simulator_after_its_filter():
 
 def test_the_robustness_figure_draws_every_f1():
     f1 = {method: {name: (1 + n) / 10 + m / 100 for n, name in enumerate(CORRUPTIONS)} for m, method in enumerate("ab")}
-    left, right = score_figures.robustness_figure(f1).axes
+    left, right = robustness_figure(f1).axes
     assert list(left.lines[1].get_xdata()) == [0, 1, 2, 5]
     assert list(left.lines[1].get_ydata()) == [f1["b"][name] for name in list(CORRUPTIONS)[:4]]
     heights = [bar.get_height() for bar in right.patches]
@@ -271,7 +273,7 @@ def test_the_figure_of_sites_draws_every_f1():
         }
         for s, site in enumerate(("hill", "dale"))
     }
-    axes = np.reshape(score_figures.sites_figure(f1, {"b": "the second", "c": "the third"}).axes, (2, 2))
+    axes = np.reshape(sites_figure(f1, {"b": "the second", "c": "the third"}).axes, (2, 2))
     for site, (upper, lower) in zip(f1, axes.T, strict=True):
         assert upper.get_title() == site
         assert [line.get_label() for line in upper.lines] == ["the second", "the third"]

@@ -15,10 +15,10 @@ from travjax.config import InputError, to_json
 from travjax.data import sites
 from travjax.data.dataset import save
 from travjax.data.provenance import SitesConfig
+from travjax.estimators.preset import TrainingConfig
 from travjax.experiments import transfer
 from travjax.experiments.transfer_runs import ARMS, TransferConfig
 from travjax.files import find_preset
-from travjax.runs.preset import TrainingConfig
 from travjax.runs.run import Run
 from travjax.simulation.robot import Robot
 

@@ -138,7 +138,7 @@ def test_a_member_that_unfolds_to_far_more_than_it_takes_is_refused(tmp_path, mo
 
 
 def test_a_member_that_does_not_fit_into_memory_is_said_before_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("travjax.rasters.memory.available", lambda: 1000)
+    monkeypatch.setattr("travjax.memory.available", lambda: 1000)
     np.savez(tmp_path / "a.npz", heights=uneven(0, 17, 17), cell_size=0.0625)
     assert refusal(tmp_path / "a.npz").startswith("heights.npy: takes 2 KiB of memory: must be at most 1 KiB")
 

@@ -25,8 +25,6 @@ from travjax.simulation import events, reference, robot
 from travjax.simulation.events import EVENTS, OPTIONAL, PAPER, Event, Pose, label_bit, label_codes
 from travjax.simulation.traverse import failures, packed, simulate, unpacked
 
-pytestmark = pytest.mark.usefixtures("compilation_cache")
-
 ROLLING = replace(HUSKY, max_roll=math.radians(6))
 FOUR = (*EVENTS, "roll")
 

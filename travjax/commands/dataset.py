@@ -1,33 +1,19 @@
 """`travjax dataset`: maps with all their labels and splits, synthetic or real, kept in one folder."""
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from travjax import progress
-from travjax.commands import options
+from travjax import options, progress
 from travjax.config import InputError, one_line, require
-from travjax.data import sites, tfds_export
-from travjax.data.dataset import SPLITS, Dataset, DatasetConfig, Progress, generate, is_dataset, load, save
+from travjax.data import tfds_export
+from travjax.data.build import build_from_sites, build_synthetic
+from travjax.data.dataset import Dataset, DatasetConfig, load
 from travjax.data.provenance import SIDES, Site, SitesConfig, Strip
-from travjax.evaluation.dataset_tables import are_headings, statistics_table, windows_table
-from travjax.files import (
-    find_preset,
-    first_lines,
-    output_folder,
-    put_back,
-    require_replaceable,
-    resolved,
-    save_text,
-    user_path,
-)
-from travjax.rasters.reading_options import DemOptions
-from travjax.simulation import traverse
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.evaluation.dataset_tables import are_statistics, dataset_tables
+from travjax.files import find_preset, require_replaceable, resolved, save_text, user_path
 
 SYNTHETIC = ("maps", "seed", "validation", "test", "world")
 """The options of a synthetic data set."""
@@ -110,43 +96,26 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.check:
         _require_left_out(arguments, MAKING, "--check is given")
     else:
-        require_replaceable(statistics, _are_statistics, f"--out {folder}", "table")
+        require_replaceable(statistics, are_statistics, f"--out {folder}", "table")
     if arguments.tfds:
         outside = not resolved(arguments.tfds).is_relative_to(resolved(folder))
         require(outside, "--tfds", str(arguments.tfds), f"a folder outside the data set, {folder}")
     dataset = load(folder) if arguments.check else _made(arguments, folder)
-    tables = _print_tables(dataset)
+    tables = dataset_tables(dataset)
+    shown = "\n\n".join(f"{headline}\n{table}" for headline, table in tables.items())
+    print(f"\n{shown}\n")
     if arguments.check:
         print(one_line(f"{folder}: all files are as they were written"))
     else:
-        progress.wrote(folder, save_text(statistics, "\n\n".join(tables) + "\n"))
+        progress.wrote(folder, save_text(statistics, "\n\n".join(tables.values()) + "\n"))
     if arguments.tfds:
         with progress.bar("exporting", len(dataset.split), "map") as bar:
             tfds_export.export(dataset, arguments.tfds, bar.update)
         progress.wrote(arguments.tfds)
 
 
-def _are_statistics(path: Path) -> bool:
-    """Whether a file holds the tables of a data set: their first line is that of the headings."""
-    return [are_headings(line) for line in first_lines(path, 1)] == [True]
-
-
-def _print_tables(dataset: Dataset) -> list[str]:
-    """Prints and returns the shares that fail and, of real maps, what became of the windows."""
-    as_in_paper = dataset.config is not None and traverse.as_in_paper(dataset.robot, dataset.actions)
-    tables = [statistics_table(dataset, as_in_paper=as_in_paper)]
-    sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
-    trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
-    print(f"\n{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:\n{tables[0]}\n")
-    if dataset.provenance:
-        tables.append(windows_table(dataset.provenance))
-        copies = int((dataset.provenance.quarter_turns > 0).sum())
-        print(f"Windows of the sites, beside which {copies} maps are turned copies:\n{tables[1]}\n")
-    return tables
-
-
 def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
-    """The data set that is asked for, saved."""
+    """Makes and saves the data set that is asked for."""
     files = bool(arguments.dem or arguments.held_out)
     if arguments.sites:
         _require_left_out(arguments, (*SYNTHETIC, "dem", "held_out", *REAL), "--sites is given")
@@ -157,11 +126,11 @@ def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
     named = SitesConfig.load(find_preset(arguments.sites, "sites")) if arguments.sites else None
     real = _sites(arguments) if files else named
     synthetic = None if real else DatasetConfig(*(getattr(arguments, name) for name in SYNTHETIC))
-    grid, robot, actions = options.configuration(arguments)
+    grid, robot, actions = options.setup(arguments)
     if real:
-        return made_of_sites(real, robot, actions, grid, folder)
+        return build_from_sites(real, robot, actions, grid, folder)
     assert synthetic
-    return made(synthetic, robot, actions, grid, folder)
+    return build_synthetic(synthetic, robot, actions, grid, folder)
 
 
 def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where: str) -> None:
@@ -171,9 +140,9 @@ def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where
 
 
 def _sites(arguments: argparse.Namespace) -> SitesConfig:
-    """The sites of DEM files."""
-    settings = options.dem_settings(arguments)
-    read = {field.name: settings.pop(field.name) for field in fields(DemOptions)}
+    """Returns the sites of DEM files."""
+    windows = options.windows(arguments)
+    read = asdict(windows.reading)
     strips: dict[str, Any] = {
         name: _strip(name, getattr(arguments, name)) for name in ("test_strip", "validation_strip")
     }
@@ -187,7 +156,9 @@ def _sites(arguments: argparse.Namespace) -> SitesConfig:
         ),
         rotations=not arguments.no_rotations,
         **{name: value for name, value in given.items() if value is not None},
-        **settings,
+        stride=windows.stride,
+        fill_holes=windows.fill_holes,
+        allow_coarse=windows.allow_coarse,
     )
 
 
@@ -198,46 +169,3 @@ def _strip(name: str, given: list[str] | None) -> Strip:
         return given[0], float(given[1])
     except ValueError:
         raise InputError(f"--{name.replace('_', '-')} = {' '.join(given)}: must be a side, then metres") from None
-
-
-def made(config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
-    """A new synthetic data set, saved in a folder, with progress bars."""
-    options.say_world(config.world, grid)
-    make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
-    return _saved(make, config.maps, folder, f"--maps = {config.maps}")
-
-
-def made_of_sites(config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: Path) -> Dataset:
-    """A new data set of real maps, saved in a folder, with progress bars."""
-    make = lambda on_progress: sites.read(config, robot, actions, grid, on_progress)
-    return _saved(make, None, folder, "the sites' windows")
-
-
-def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path, what: str) -> Dataset:
-    """What `make` makes; `total` maps, if that is known before."""
-    _require_free(folder)
-    try:
-        with progress.bar("making", total, "map", delay=0.1) as bar:  # none where a file is refused at once
-            dataset = make(bar.update)
-    except MemoryError as error:
-        raise InputError(f"{what}: do not fit in memory: {error}") from None
-    size = sum(array.nbytes for array in dataset.arrays.values())
-    with progress.bar("saving", size, "B", unit_scale=True) as bar:
-        # The files' headers are not in the total.
-        save(dataset, folder, lambda added: bar.update(min(added, size - bar.n)))
-    return dataset
-
-
-def _require_free(folder: Path) -> None:
-    """Refuses, before minutes of work, what `save` would refuse after them, and to replace the working folder."""
-    require(resolved(folder) != Path.cwd(), "--out", str(folder), "another folder than the one you are in")
-    put_back(folder)
-    try:
-        empty = not folder.exists() or folder.is_dir() and not any(folder.iterdir())
-    except OSError as error:
-        raise InputError(f"--out {folder}: cannot be read: {error.strerror or error}") from None
-    if not empty and not is_dataset(folder):
-        raise InputError(f"--out {folder}: holds something else: must be a new or empty folder, or that of a data set")
-    if not empty:
-        progress.say(f"{folder}: the data set there will be replaced")
-    output_folder(folder.parent)

@@ -4,8 +4,7 @@ import argparse
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from travjax import progress
-from travjax.commands import options
+from travjax import options, progress
 from travjax.config import InputError, require
 from travjax.files import output_folder, user_path
 from travjax.resnet.preprocessing import INPUTS
@@ -77,12 +76,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _told(arguments: argparse.Namespace) -> dict[str, Any]:
-    """What the user knows of the weights."""
+    """Returns what the user knows of the weights."""
     return {"input": arguments.input, "stride_in": arguments.stride_in, "prefix": arguments.prefix}
 
 
 def _fetched(arguments: argparse.Namespace) -> "Weights":
-    """Weights of the hub, the repository in their origin."""
+    """Fetches weights of the hub, and names the repository in their origin."""
     from travjax.resnet.imagenet_weights import HUB, fetch, load_weights
 
     repository, filename = arguments.hub or HUB[0], arguments.file or HUB[1]

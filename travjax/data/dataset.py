@@ -282,6 +282,10 @@ def load(folder: str | Path) -> Dataset:
         raise InputError(f"{folder}: {error}") from None
 
 
+load_dataset = load
+"""The public name of `load`, `travjax.load_dataset`."""
+
+
 def _read_array(path: Path) -> np.ndarray:
     try:
         with path.open("rb") as file, warnings.catch_warnings():

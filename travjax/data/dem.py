@@ -15,11 +15,11 @@ import numpy as np
 
 from travjax.config import InputError, require, require_number
 from travjax.files import sha256, user_path
+from travjax.memory import require_memory
 from travjax.point_clouds.clouds import cloud_of_arrays, read_cloud
 from travjax.rasters.array_files import rasters_of, read_npy, read_npz
 from travjax.rasters.formats import unfolded
 from travjax.rasters.gdal_files import read_raster
-from travjax.rasters.memory import require_memory
 from travjax.rasters.raster import Raster, Survey, require_fine, require_known, require_size, survey
 from travjax.rasters.reading_options import DemOptions
 from travjax.rasters.surface import Surface

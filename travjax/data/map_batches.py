@@ -1,24 +1,129 @@
 """Batches of maps with where they come from, their labels, and which of them to show.
 
+A `MapStream` makes them from styles and seeds, or reads them from elevation maps.
+
 A batch is a dict of arrays with a common leading axis: `heights` [n, rows, cols] and `group` [n] (style or file), what
 else tells its maps apart, and, once labelled, the margins, `known` and `failed`.
 """
 
-from collections.abc import Iterable, Iterator
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from travjax.batching import BATCH
 from travjax.config import one_line, require, to_json
-from travjax.data.dem import Windows
+from travjax.data.dem import Windows, load_dem
+from travjax.rasters.reading_options import DemOptions
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.rock_field import rock_fields, sample_rock_field
-from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params
+from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params, world_note
 
 Batch = dict[str, np.ndarray]
+
+Say = Callable[[str], object]
+"""Is given lines that say what maps there are."""
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """How elevation maps are read and cut into windows, as `load_dem` takes it.
+
+    stride: metres between the windows
+    """
+
+    reading: DemOptions = DemOptions()
+    stride: float = 8.0
+    fill_holes: bool = True
+    allow_coarse: bool = False
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Returns them by the names of `load_dem`."""
+        own = {name: getattr(self, name) for name in ("stride", "fill_holes", "allow_coarse")}
+        return dataclasses.asdict(self.reading) | own
+
+
+@dataclass(frozen=True)
+class MapStream:
+    """Maps that are made or read batch by batch, so that they need not fit into memory.
+
+    total:   number of maps
+    batches: the maps, once
+    files:   how each elevation map was read; none of synthetic maps
+    world:   metres, the map size that features of synthetic maps are derived from, if it was given
+    paper:   whether they are of the paper's styles, so that failure shares compare with its own
+    """
+
+    total: int
+    batches: Iterator[Batch]
+    files: tuple[dict[str, Any], ...] = ()
+    world: float | None = None
+    paper: bool = False
+
+    @staticmethod
+    def synthetic(
+        styles: Sequence[str],
+        seeds: Sequence[int],
+        grid: Grid,
+        world: float | None = None,
+        say: Say = lambda line: None,
+    ) -> "MapStream":
+        """Makes maps of these seeds [n], the styles in turn.
+
+        Raises InputError as `generate_terrain` does.
+        """
+        names = [styles[number % len(styles)] for number in range(len(seeds))]
+        rocky = are_rock_fields(names, world)
+        note = None if rocky else world_note(world, grid)
+        if note:
+            say(note)
+        batches = synthetic_batches(names, list(seeds), grid, world)
+        return MapStream(len(seeds), batches, world=world, paper=not rocky)
+
+    @staticmethod
+    def from_files(
+        paths: Sequence[Path], grid: Grid, options: WindowOptions = WindowOptions(), say: Say = lambda line: None
+    ) -> "MapStream":
+        """Reads the windows of elevation maps; `say` is told of each file what its windows cover.
+
+        Raises InputError as `load_dem` does.
+        """
+        names = [path.name for path in paths]
+        sites, files = [], []
+        for path in paths:
+            windows = load_dem(path, grid=grid, **options.settings)
+            for line in _described(path, windows):
+                say(one_line(line))
+            sites.append((path.name if names.count(path.name) == 1 else str(path), windows))
+            read = {
+                name: getattr(windows, name) for name in ("path", "sha256", "covered", "filled", "unknown", "notes")
+            }
+            read |= {"crs": windows.crs, "height_offset": np.ravel(windows.height_offset).tolist()}
+            files.append(read | options.settings | {"cell_size": windows.cell_size})
+        return MapStream(sum(len(windows) for _, windows in sites), dem_batches(sites), tuple(files))
+
+
+def _described(path: Path, windows: Windows) -> list[str]:
+    """Returns lines on a file and the windows that were cut out of it."""
+    systems = dict.fromkeys(windows.systems().tolist())
+    said = (
+        f"{path}: {len(windows)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
+        f"crs {', '.join(map(_shown, systems))}, {windows.filled:.3%} filled in small holes, "
+        f"{windows.unknown:.1%} unknown"
+    )
+    return [said, *(f"{path}: {note}" for note in windows.notes)]
+
+
+def _shown(crs: str) -> str:
+    """Returns the code of a coordinate system, or the name of one without a code."""
+    return crs.split('"')[1] if '"' in crs else crs or "none"
 
 
 def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: float | None = None) -> Iterator[Batch]:

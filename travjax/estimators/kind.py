@@ -38,7 +38,7 @@ class Batch(NamedTuple):
     weight: Float[np.ndarray, " b"] | Float[Array, " b"]
 
 
-class TrainingData(Protocol):
+class TrajectorySamples(Protocol):
     """What a run is trained and validated on, on the host."""
 
     dataset: Dataset
@@ -133,7 +133,7 @@ class EstimatorKind(Protocol):
     ) -> PyTree:
         """Returns what is put on the devices of maps, NaN unknown; on_progress: is told of trajectories."""
 
-    def data(self, preset: Preset, dataset: Dataset) -> TrainingData:
+    def data(self, preset: Preset, dataset: Dataset) -> TrajectorySamples:
         """Returns what of a data set is trained on.
 
         Raises InputError when there are no training or no validation samples.

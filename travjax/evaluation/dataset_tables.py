@@ -4,6 +4,7 @@ Counted from the packed labels a few maps at a time, since a data set of the pap
 """
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 
@@ -12,8 +13,10 @@ from travjax.data.dataset import SPLITS, Dataset
 from travjax.data.provenance import Provenance
 from travjax.data.sampling import MAPS_AT_ONCE, Samples, are_known, balanced_subset
 from travjax.evaluation.tables import ANY, PAPER_SHARES, rows_table
+from travjax.files import first_lines
 from travjax.simulation.events import EVENTS, FAILED, label_bit, label_codes
 from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import as_in_paper
 
 WINDOW_COLUMNS = {
     "name": "site",
@@ -29,16 +32,35 @@ WINDOW_COLUMNS = {
 
 
 def columns_of(robot: Robot) -> dict[str, str]:
-    """Keys and headings of the columns of `statistics_table` for a robot's data set."""
+    """Returns keys and headings of the columns of `statistics_table` for a robot's data set."""
     same = {name: name for name in ("maps", "samples", *robot.event_names, ANY)}
     return {"what": ""} | same | {"none": "maps with none", "known": "known"}
 
 
 def are_headings(line: str) -> bool:
-    """Whether a line is the first one of `statistics_table`, for a robot of any events."""
+    """Tells whether a line is the first one of `statistics_table`, for a robot of any events."""
     first, last = ["maps", "samples", *EVENTS], [*ANY.split(), "maps", "with", "none", "known"]
     words = line.split()
     return words[: len(first)] == first and words[len(first) :][-len(last) :] == last
+
+
+def dataset_tables(dataset: Dataset) -> dict[str, str]:
+    """Returns tables by their headlines: the shares that fail and, of real maps, what became of the windows."""
+    in_paper = dataset.config is not None and as_in_paper(dataset.robot, dataset.actions)
+    sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
+    trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
+    headline = f"{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:"
+    tables = {headline: statistics_table(dataset, as_in_paper=in_paper)}
+    if dataset.provenance:
+        copies = int((dataset.provenance.quarter_turns > 0).sum())
+        headline = f"Windows of the sites, beside which {copies} maps are turned copies:"
+        tables[headline] = windows_table(dataset.provenance)
+    return tables
+
+
+def are_statistics(path: Path) -> bool:
+    """Tells whether a file holds the tables of a data set: its first line is that of the headings."""
+    return [are_headings(line) for line in first_lines(path, 1)] == [True]
 
 
 def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True) -> str:

@@ -19,6 +19,9 @@ from travjax.simulation.events import EVENTS
 OVERALL = "overall"
 NAMES = (*EVENTS, OVERALL)
 THRESHOLD = 0.5
+RECALLS = (0.9, 0.99)
+"""Recalls that thresholds are found for, unless others are asked for."""
+
 CURVE_POINTS = 300
 """Points of a precision-recall curve that an Evaluation keeps."""
 
@@ -258,7 +261,7 @@ def evaluate(
     groups: Sequence[str] | np.ndarray | None = None,
     *,
     events: Sequence[str] = EVENTS,
-    recalls: Sequence[float] = (0.9, 0.99),
+    recalls: Sequence[float] = RECALLS,
     paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
     threshold: float = THRESHOLD,
 ) -> Evaluation:

@@ -1,6 +1,6 @@
 """Figures of evaluation and training: precision and recall, calibration, training curves, network inputs.
 
-Functions return a matplotlib Figure; `plots.save` writes it.
+Functions return a matplotlib Figure; `map_figures.save` writes it.
 """
 
 import math
@@ -11,9 +11,7 @@ from itertools import cycle, pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
-from travjax.config import one_line
 from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, THRESHOLD, Confusion, Curve, Evaluation
-from travjax.evaluation.transfer_scores import Results
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 
@@ -166,31 +164,6 @@ def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
 _PHASE = dict(xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8, color="0.4")
 
 
-def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
-    """F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
-
-    arms: their colours; maps: what they are trained on
-    Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
-    """
-    figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
-    for ax, site in zip(axes, results.sites, strict=True):
-        for arm in results.arms:
-            colour = arms[arm]
-            f1 = np.nan_to_num(results.f1(arm, site))
-            epochs = np.arange(f1.shape[1])
-            ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)
-            ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
-        always = results.always(site)
-        ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
-        ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
-        ax.set(xlabel=f"epoch on {maps}", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
-        ax.grid(alpha=0.3)
-    axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
-    axes[0].legend(fontsize=9)
-    return figure
-
-
 def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid = Grid()) -> Figure:
     """Network inputs, one sample a row: the three channels and the three as red, green and blue (the paper's Fig. 1).
 
@@ -217,90 +190,4 @@ def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid 
         ax.set_title(name, fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel("x, right [m]")
-    return figure
-
-
-def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
-    """F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
-
-    f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
-    """
-    figure = Figure(figsize=(12.5, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.3))
-    names = list(next(iter(f1.values())))
-    noisy = [name for name in names if name.startswith("noise")]
-    others = [name for name in names if name not in noisy]
-    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
-    width = 0.8 / len(f1)
-    for number, (method, of) in enumerate(f1.items()):
-        colour = f"C{number}"
-        left.plot(noises, [of[others[0]], *(of[name] for name in noisy)], "o-", color=colour, label=method)
-        places = np.arange(len(others)) + (number - (len(f1) - 1) / 2) * width
-        bars = right.bar(places, [of[name] for name in others], width, color=colour)
-        right.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
-    left.set(xlabel="noise at each node [cm]", ylabel=f"F1 at {THRESHOLD:g}, events pooled", ylim=(0, 1.05))
-    right.set_xticks(range(len(others)), [name if name != others[0] else "clean" for name in others])
-    for ax in (left, right):
-        ax.grid(alpha=0.3)
-    left.legend(fontsize=9)
-    return figure
-
-
-OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
-"""Colours that the colour-blind can tell apart (Okabe and Ito 2008)."""
-
-
-def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
-    """F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
-
-    f1:      by site, method and corruption: "none", "noise 2 cm", or another
-    methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
-    """
-    names = list(next(iter(next(iter(f1.values())).values())))
-    clean, noisy = names[0], [name for name in names if name.startswith("noise")]
-    others = [name for name in names if name not in noisy]
-    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
-    figure = Figure(figsize=(2.9 * len(f1) + 0.6, 6.2), layout="constrained")
-    axes = figure.subplots(2, len(f1), sharey=True, squeeze=False)
-    styles = list(zip(methods, OKABE_ITO, "osv^DP", cycle(("-", "--", "-.", ":")), strict=False))
-    for (upper, lower), (site, of) in zip(axes.T, f1.items(), strict=True):
-        for number, (method, colour, marker, line) in enumerate(styles):
-            style = dict(color=colour, marker=marker, markersize=5)
-            values = [of[method][name] for name in (clean, *noisy)]
-            upper.plot(noises, values, linestyle=line, label=methods[method], **style)
-            aside = np.arange(len(others)) + 0.16 * (number - (len(styles) - 1) / 2)
-            lower.plot(aside, [of[method][name] for name in others], linestyle="none", **style)
-        upper.set(title=site, xlabel="noise at each node [cm]", xlim=(-0.25, max(noises) + 0.25), ylim=(0, 1.05))
-        lower.set(xlim=(-0.5, len(others) - 0.5))
-        words = [name.replace(" missing", "\nmissing") if name != clean else "clean" for name in others]
-        lower.set_xticks(range(len(others)), words)
-        for ax in (upper, lower):
-            ax.grid(alpha=0.3)
-    for ax in axes[:, 0]:
-        ax.set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(styles), fontsize=9)
-    return figure
-
-
-def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
-    """F1 against the time for all trajectories of a map.
-
-    points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
-    """
-    figure = Figure(figsize=(9, 5.6), layout="constrained")
-    ax = figure.subplots()
-    for number, (name, (seconds, clean, noisy)) in enumerate(points.items()):
-        ax.plot([seconds, seconds], [clean, noisy], "-", color=f"C{number}", alpha=0.4)
-        ax.plot(seconds, clean, "o", color=f"C{number}", label=f"{name}: {seconds:.3g} s")
-        ax.plot(seconds, noisy, "v", color=f"C{number}")
-    for marker, label in (("o", "clean map"), ("v", "at the largest noise, simulators after the best filter")):
-        ax.plot([], [], marker, color="0.4", label=label)
-    ax.set_xscale("log")
-    ax.set(
-        xlabel="s for all trajectories of a map",
-        ylabel=f"F1 at {THRESHOLD:g}, events pooled",
-        ylim=(0, 1.05),
-    )
-    ax.grid(alpha=0.3)
-    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return figure

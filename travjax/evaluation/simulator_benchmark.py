@@ -17,7 +17,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from travjax import progress
 from travjax.config import InputError
+from travjax.evaluation import map_figures
+from travjax.evaluation.tables import rows_table
+from travjax.files import atomic_write, output_folder
 from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -42,7 +46,7 @@ SEQUENTIAL = "sequential NumPy simulator"
 
 
 def machine() -> str:
-    """The device and versions that a figure belongs to, in one line."""
+    """Returns the device and versions that a figure belongs to, in one line."""
     device = jax.devices()[0]
     name = processor() if device.platform == "cpu" else device.device_kind
     versions = f"jax {jax.__version__}, Python {platform.python_version()}"
@@ -50,7 +54,7 @@ def machine() -> str:
 
 
 def processor() -> str:
-    """The name of the processor, or its kind where the system does not tell."""
+    """Returns the name of the processor, or its kind where the system does not tell."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -68,8 +72,42 @@ def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
         raise InputError(f"sequential simulator: {' '.join(str(error).split())}") from None
 
 
+def measure(
+    robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15, stream: int = 0
+) -> None:
+    """Measures terrain, labelling and the sequential simulator; prints the table and writes it as TSV and a figure.
+
+    repeats: timed calls of which the median is taken
+    stream:  maps to make and label besides, 0 for none
+    Raises InputError as `check` does, and when nothing can be written to `out`.
+    """
+    check(robot, actions, grid)
+    folder, rows = output_folder(out), [start_row()]
+    # First calls are to compile, not to read the cache.
+    jax.config.update("jax_enable_compilation_cache", False)
+    measured = kernel_rows(robot, actions, grid, repeats)
+    rows += list(progress.bar("kernels", 2 * len(BATCHES), "row", iterable=measured))
+    with progress.bar("sequential simulator", len(actions), "trajectory") as bar:
+        rows.append(reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
+    if stream:
+        with progress.bar("stream", stream, "map") as bar:
+            rows.append(stream_row(stream, robot, actions, grid, bar.update))
+    rows = with_speed_up(rows)
+    write_rows(rows, COLUMNS, folder / "bench.tsv")
+    kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
+    progress.wrote(map_figures.save(map_figures.speed_figure(kernels), folder / "bench.png"))
+
+
+def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
+    """Prints the table of measured rows with the machine, and writes it as TSV; columns: their headings."""
+    progress.say(f"\n{machine()}\n{rows_table(rows, columns)}\n")
+    with atomic_write(path) as temporary:
+        write_tsv(rows, temporary, columns)
+    progress.wrote(path)
+
+
 def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
-    """Terrain and labelling on compiled code, a row for each batch size."""
+    """Measures terrain and labelling on compiled code, a row for each batch size."""
     for maps in BATCHES:
         styles, seeds = _mixture(0, maps)
         make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
@@ -79,7 +117,7 @@ def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) ->
 
 
 def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
-    """Labelling of so many maps at once, on compiled code."""
+    """Measures labelling of so many maps at once, on compiled code."""
     heights = generate_terrain(*_mixture(0, maps), grid=grid)
     heights = heights[0] if maps == 1 else heights
     return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
@@ -88,7 +126,7 @@ def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, rep
 def reference_row(
     robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
 ) -> dict:
-    """One whole map by the sequential simulator, one trajectory after the other.
+    """Measures one whole map by the sequential simulator, one trajectory after the other.
 
     on_progress: is told how many trajectories of a call are done
     """
@@ -115,7 +153,7 @@ def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_pro
 
 
 def start_row() -> dict:
-    """A new process from its start to its end, one map labelled, the compilation cache filled by an earlier process."""
+    """Measures a new process that labels one map, the compilation cache filled by an earlier process."""
     seconds = []
     for _ in range(4):
         with tempfile.TemporaryDirectory() as folder:
@@ -129,14 +167,14 @@ def start_row() -> dict:
 
 
 def with_speed_up(rows: list[dict]) -> list[dict]:
-    """The rows with how many times faster than the sequential simulator each labels a map."""
+    """Returns the rows with how many times faster than the sequential simulator each labels a map."""
     sequential = next(row["ms_per_map"] for row in rows if row["what"] == SEQUENTIAL)
     simulates = lambda row: row["trajectories_per_s"] is not None
     return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
 
 
 def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
-    """One line for each row, the keys in `columns` and `machine` as header: this one, unless a row names its own."""
+    """Writes a line for each row under the keys in `columns` and `machine`: this one, unless a row names its own."""
     here = machine()
     cells = [
         [*("" if row[key] is None else str(row[key]) for key in columns), row.get("machine", here)] for row in rows

@@ -18,7 +18,7 @@ from travjax import progress
 from travjax.config import InputError, require, to_json
 from travjax.data.provenance import SitesConfig
 from travjax.estimators.names import FIELD, RESNET
-from travjax.evaluation import map_figures, metrics, score_figures, simulator_benchmark
+from travjax.evaluation import map_figures, metrics, simulator_benchmark
 from travjax.evaluation.metrics import OVERALL
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch, timing
@@ -34,8 +34,11 @@ from travjax.experiments.robustness_scores import (
     f1_of,
     f1_of_site,
     on_sites,
+    quality_figure,
     quality_table,
+    robustness_figure,
     shown,
+    sites_figure,
     sites_table,
 )
 from travjax.files import find_data, find_preset, output_folder, save_text, user_path
@@ -49,7 +52,7 @@ SITES = "real"
 """The preset of the real ground unless another is given."""
 
 SEED = 20_251_125
-"""Of the test maps, the validation maps having the next one.
+"""The seed of the test maps; the validation maps have the next one.
 
 A data set draws its terrain seeds from its own seed and size together, so that maps of another seed or size are other
 maps. Presets have seed 0: none of their maps is among these, nor is a test map among the validation maps.
@@ -160,7 +163,7 @@ def _load(option: str, source: Path | None, model: str) -> Predictor:
 
 
 def _sites(given: str | None, ground: str) -> SitesConfig | None:
-    """The sites to compare on; None, and a line that says why, where those of the experiment are not at hand."""
+    """Returns the sites to compare on, or says in a line why the experiment's are not at hand, and returns None."""
     if ground == SYNTHETIC:
         return None
     try:
@@ -182,7 +185,7 @@ def _synthetic(what: str, count: int, seed: int, field: Predictor) -> BenchmarkM
 
 
 def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict]:
-    """Rows of experiments/timing.py for the simulators and the ResNet50, and two for the hazard field."""
+    """Returns rows of experiments/timing.py for the simulators and the ResNet50, and two for the hazard field."""
     trained = field.run
     trunk = resnet.run.preset.trunk if resnet else ResNetConfig()
     rows = timing.measured(trained.robot, trained.actions, trained.grid, trunk, 64, repeats)
@@ -242,8 +245,8 @@ def _on_synthetic_ground(
     save_text(out / "f1.tsv", "\n".join(lines) + "\n")
     seconds = {row["what"]: row["seconds"] for row in rows}
     figures = {
-        "robustness": score_figures.robustness_figure(f1),
-        "quality": score_figures.quality_figure(_points(f1, seconds)),
+        "robustness": robustness_figure(f1),
+        "quality": quality_figure(_points(f1, seconds)),
     }
     tables = {
         "Quality": f"{quality_table(clean)}\n\n{margins}",
@@ -274,7 +277,7 @@ def _on_real_ground(
     table = sites_table(scores, chosen)
     save_text(out / "sites.txt", f"{headline}\n\n{table}\n")
     f1 = {site: f1_of_site(of, chosen) for site, of in scores.items()}
-    figure = map_figures.save(score_figures.sites_figure(f1, IN_FIGURE), out / "sites.png")
+    figure = map_figures.save(sites_figure(f1, IN_FIGURE), out / "sites.png")
     numbers = {
         "sites": to_json(config),
         "windows": {site: len(ground.heights) for site, ground in real.items()},
@@ -303,7 +306,7 @@ def _write(parts: Sequence[Part], out: Path) -> None:
 def _points(
     f1: Mapping[str, Mapping[str, float]], seconds: Mapping[str, float]
 ) -> dict[str, tuple[float, float, float]]:
-    """(seconds a map, F1 on clean maps, F1 at the largest noise) of each way.
+    """Returns (seconds a map, F1 on clean maps, F1 at the largest noise) of each way.
 
     The simulators are drawn with the best filter, the time of which is left out: without one they would look worse on
     the noisy map than they have to be.

@@ -11,11 +11,11 @@ GOES_ON = "the same command goes on from there"
 """What an experiment says when it is stopped."""
 
 Piece = str | Path
-"""Of a report: text, or a figure."""
+"""A part of a report: text, or a figure."""
 
 
 def parser(name: str, description: str) -> Parser:
-    """An empty parser for `python -m travjax.experiments.NAME`."""
+    """Returns an empty parser for `python -m travjax.experiments.NAME`."""
     return Parser(prog=f"python -m travjax.experiments.{name}", description=description)
 
 
@@ -43,5 +43,5 @@ def _figure(path: Path) -> str:
 
 
 def verbatim(text: str, language: str = "") -> str:
-    """Text as it stands, for a report."""
+    """Returns a text as it stands, for a report."""
     return f"```{language}\n{text}\n```"

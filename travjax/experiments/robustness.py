@@ -95,7 +95,7 @@ class BenchmarkMaps:
         grid: Grid,
         on_progress: Progress = lambda count: None,
     ) -> "BenchmarkMaps":
-        """Maps of all styles, drawn as a data set of that size and seed draws them; on_progress: is told of maps."""
+        """Makes maps of all styles as a data set of that size and seed draws them; on_progress: is told of maps."""
         config, batches = DatasetConfig(count, seed), []
         for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), grid):
             batches.append(labelled(batch, robot, actions, grid))
@@ -104,7 +104,7 @@ class BenchmarkMaps:
 
     @staticmethod
     def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
-        """Windows of real maps; heights: NaN unknown."""
+        """Labels windows of real maps; heights: NaN unknown."""
         return BenchmarkMaps._from_batch(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
 
     @staticmethod
@@ -114,17 +114,17 @@ class BenchmarkMaps:
         return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
 
     def seen(self, name: str, seed: int) -> Maps:
-        """The maps with a corruption of CORRUPTIONS, the same each time."""
+        """Returns the maps with a corruption of CORRUPTIONS, the same each time."""
         rng = np.random.default_rng((seed, list(CORRUPTIONS).index(name)))
         return np.asarray(CORRUPTIONS[name](self.heights, rng), np.float32)
 
     def simulated(self, maps: Maps) -> Fails:
-        """What the simulator says of maps: 1 fails, 0 does not."""
+        """Returns what the simulator says of maps: 1 fails, 0 does not."""
         margins = simulate(maps, self.robot, self.actions, grid=self.grid).events()
         return (np.asarray(margins) > np.asarray(self.robot.limits, np.float32)).astype(np.float32)
 
     def best_filter(self, maps: Maps, on_progress: Progress = lambda count: None) -> str:
-        """The one of FILTERS after which the simulator has the largest F1 on these maps, corrupted as they are."""
+        """Returns the one of FILTERS after which the simulator has the largest F1 on these corrupted maps."""
         scores = {}
         for name, smooth in FILTERS.items():
             scores[name] = self.scores(self.simulated(smooth(maps)))[OVERALL].f1
@@ -132,7 +132,7 @@ class BenchmarkMaps:
         return max(scores, key=lambda name: scores[name])
 
     def scores(self, fails: Fails, threshold: float = 0.5) -> dict[str, Confusion]:
-        """The confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, k]."""
+        """Returns the confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, k]."""
         return scores(fails[self.known], self.failed[self.known], threshold, self.robot.event_names)
 
 
@@ -145,7 +145,7 @@ def of_sites(
     grid: Grid,
     on_progress: Progress = lambda count: None,
 ) -> dict[str, BenchmarkMaps]:
-    """The windows of each site by its name: all that are known well enough, or `most` drawn at random.
+    """Returns the windows of each site by its name: all that are known well enough, or `most` drawn at random.
 
     config: its splits and turns are left aside; on_progress: is told of windows that were read
     Raises InputError when a file is missing, cannot be read or leaves no window.
@@ -161,12 +161,12 @@ def of_sites(
 
 
 def by_margins(margins: Float[np.ndarray, "n t k"], robot: Robot) -> Fails:
-    """Scores of regressed margins, which are 0.5 at the robot's limits."""
+    """Returns scores of regressed margins, which are 0.5 at the robot's limits."""
     return np.clip(margins / np.asarray(robot.limits, np.float32) / 2, 0, 1)
 
 
 def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
-    """Probabilities of an estimator for samples [m] of maps: [m, k]; on_progress: is told of samples."""
+    """Returns probabilities of an estimator for samples [m] of maps: [m, k]; on_progress: is told of samples."""
     devices = Devices.all()
     placed = Placed.from_network(predictor.network, devices.replicate(predictor.run.source(maps)), devices)
     return probabilities(predictor.run.kind.logits(placed, samples, 64 * devices.mesh.size, on_progress))
@@ -175,14 +175,14 @@ def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: 
 def scores(
     fails: Fails, failed: Bool[np.ndarray, "*m k"], threshold: float = 0.5, events: Sequence[str] = EVENTS
 ) -> dict[str, Confusion]:
-    """The confusion of each event, given by name, and of all pooled."""
+    """Returns the confusion of each event, given by name, and of all pooled."""
     return confusions(fails.reshape(-1, len(events)), failed.reshape(-1, len(events)), threshold, events)
 
 
 def average_precisions(
     fails: Fails, failed: Bool[np.ndarray, "*m k"], events: Sequence[str] = EVENTS
 ) -> dict[str, float]:
-    """Of each event, given by name, and of all pooled."""
+    """Returns the average precision of each event, given by name, and of all pooled."""
     columns = {name: (fails[..., event], failed[..., event]) for event, name in enumerate(events)}
     pairs = columns | {OVERALL: (fails, failed)}
     return {name: average_precision(one.ravel(), true.ravel()) for name, (one, true) in pairs.items()}

@@ -1,14 +1,16 @@
-"""Scores of the comparison: the names of the methods, what each reaches on a ground, and the tables of it."""
+"""Scores of the comparison: the names of the methods, what each reaches on a ground, its tables and figures."""
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from travjax import progress
 from travjax.data.sampling import Samples
 from travjax.evaluation import metrics
-from travjax.evaluation.metrics import OVERALL, Confusion
+from travjax.evaluation.metrics import OVERALL, THRESHOLD, Confusion
 from travjax.evaluation.tables import rows_table
 from travjax.experiments.robustness import (
     CLEAN,
@@ -40,14 +42,14 @@ IN_FIGURE = {
 """Methods of ON_SITES that the figure of real ground shows, and their names in it."""
 
 RECALL = 0.97
-"""For which a threshold is chosen on validation maps."""
+"""The recall for which a threshold is chosen on validation maps."""
 
 SiteScores = dict[str, dict[str, dict[str, Confusion]]]
-"""Of one site: by corruption, method and event."""
+"""Confusions of one site: by corruption, method and event."""
 
 
 def best_filters(validation: BenchmarkMaps, seed: int) -> dict[str, str]:
-    """For every corruption the filter of FILTERS after which the simulator is best on the validation maps."""
+    """Returns for every corruption the filter after which the simulator is best on the validation maps."""
     with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
         return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
 
@@ -61,7 +63,7 @@ def compare(
     chosen: Mapping[str, str],
     seed: int,
 ) -> dict:
-    """For every corruption: the filter chosen for it, and for every method its confusions and average precisions."""
+    """Returns for every corruption its filter, and every method's confusions and average precisions."""
     results: dict[str, dict] = {}
     drawn, events = _drawn(test, samples, seed), test.robot.event_names
     methods = 3 + (resnet is not None)
@@ -92,7 +94,7 @@ def _margins(margins: np.ndarray | None) -> np.ndarray:
 
 
 def _drawn(test: BenchmarkMaps, samples: int, seed: int) -> Samples:
-    """Random trajectories of all maps, for what is too slow for all of them."""
+    """Draws random trajectories of all maps, for what is too slow for all of them."""
     rng = np.random.default_rng(seed)
     maps, trajectories = test.failed.shape[:2]
     places = np.sort(rng.choice(maps * trajectories, min(samples, maps * trajectories), replace=False))
@@ -105,7 +107,7 @@ def _scored(fails: np.ndarray, failed: np.ndarray, events: Sequence[str]) -> dic
 
 
 def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predictor, predicted: Predicted) -> dict:
-    """The threshold for RECALL, chosen on validation maps, and the errors of the margins."""
+    """Returns the threshold for RECALL, chosen on validation maps, and the errors of the margins."""
     events = test.robot.event_names
     probability = field.predict(validation.heights).probability
     threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
@@ -119,7 +121,7 @@ def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predic
 
 
 def on_sites(real: Mapping[str, BenchmarkMaps], field: Predictor, seed: int) -> dict[str, SiteScores]:
-    """For every site and corruption: the confusions of the simulator after each filter, and of the hazard field."""
+    """Returns by site and corruption the confusions of the simulator after each filter, and of the hazard field."""
     with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
         return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
 
@@ -140,7 +142,7 @@ def _of_site(ground: BenchmarkMaps, field: Predictor, seed: int, on_progress: Pr
 
 
 def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
-    """F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
+    """Returns F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
     return {
         method: {name: one["methods"][method]["confusion"][OVERALL].f1 for name, one in results.items()}
         for method in METHODS
@@ -149,13 +151,13 @@ def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
 
 
 def f1_of_site(site: SiteScores, chosen: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: of each corruption the filter."""
+    """Returns F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: each one's filter."""
     f1 = {method: {name: of[method][OVERALL].f1 for name, of in site.items()} for method in ON_SITES}
     return f1 | {FILTERED: {name: f1[smooth][name] for name, smooth in chosen.items()}}
 
 
 def shown(value: float) -> str:
-    """A share with three digits, or a dash where it is undefined."""
+    """Shows a share with three digits, or a dash where it is undefined."""
     return "-" if math.isnan(value) else f"{value:.3f}"
 
 
@@ -163,7 +165,7 @@ QUALITY = {"method": "clean maps", "event": "", "recall": "recall", "precision":
 
 
 def quality_table(clean: dict) -> str:
-    """Recall, precision, F1 and average precision of each method and event on the clean maps."""
+    """Returns a table of recall, precision, F1 and average precision of each method and event on the clean maps."""
     rows = []
     for method, scored in clean["methods"].items():
         if method == FILTERED:
@@ -182,7 +184,7 @@ def _quality(method: str, event: str, confusion: Confusion, precision: float) ->
 
 
 def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> str:
-    """F1 of every method on real ground: for each corruption a row a site; below it filters and who is ahead.
+    """Returns a table of F1 on real ground: for each corruption a row a site; below it filters and who is ahead.
 
     sites: scores by name; chosen: of each corruption the filter of FILTERED
     """
@@ -202,10 +204,96 @@ def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> s
 
 
 def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """One line: on how many sites the field is above the simulator after the best filter; f1: by site and method."""
+    """Says on how many sites the field is above the simulator after the best filter; f1: by site and method."""
     counts = []
     for name in CORRUPTIONS:
         measured = [of for of in f1.values() if not math.isnan(of[HAZARD][name])]
         better = sum(of[HAZARD][name] > of[FILTERED][name] for of in measured)
         counts.append(f"{name}: {better} of {len(measured)}")
     return f"Sites on which the hazard field is above the simulator after the best filter: {'; '.join(counts)}."
+
+
+def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Draws F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
+
+    f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
+    """
+    figure = Figure(figsize=(12.5, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.3))
+    names = list(next(iter(f1.values())))
+    noisy = [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    width = 0.8 / len(f1)
+    for number, (method, of) in enumerate(f1.items()):
+        colour = f"C{number}"
+        left.plot(noises, [of[others[0]], *(of[name] for name in noisy)], "o-", color=colour, label=method)
+        places = np.arange(len(others)) + (number - (len(f1) - 1) / 2) * width
+        bars = right.bar(places, [of[name] for name in others], width, color=colour)
+        right.bar_label(bars, fmt="%.2f", fontsize=7, padding=1)
+    left.set(xlabel="noise at each node [cm]", ylabel=f"F1 at {THRESHOLD:g}, events pooled", ylim=(0, 1.05))
+    right.set_xticks(range(len(others)), [name if name != others[0] else "clean" for name in others])
+    for ax in (left, right):
+        ax.grid(alpha=0.3)
+    left.legend(fontsize=9)
+    return figure
+
+
+OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
+"""Colours that the colour-blind can tell apart (Okabe and Ito 2008)."""
+
+
+def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
+    """Draws F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
+
+    f1:      by site, method and corruption: "none", "noise 2 cm", or another
+    methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
+    """
+    names = list(next(iter(next(iter(f1.values())).values())))
+    clean, noisy = names[0], [name for name in names if name.startswith("noise")]
+    others = [name for name in names if name not in noisy]
+    noises = [0.0, *(float(name.split()[1]) for name in noisy)]
+    figure = Figure(figsize=(2.9 * len(f1) + 0.6, 6.2), layout="constrained")
+    axes = figure.subplots(2, len(f1), sharey=True, squeeze=False)
+    styles = list(zip(methods, OKABE_ITO, "osv^DP", cycle(("-", "--", "-.", ":")), strict=False))
+    for (upper, lower), (site, of) in zip(axes.T, f1.items(), strict=True):
+        for number, (method, colour, marker, line) in enumerate(styles):
+            style = dict(color=colour, marker=marker, markersize=5)
+            values = [of[method][name] for name in (clean, *noisy)]
+            upper.plot(noises, values, linestyle=line, label=methods[method], **style)
+            aside = np.arange(len(others)) + 0.16 * (number - (len(styles) - 1) / 2)
+            lower.plot(aside, [of[method][name] for name in others], linestyle="none", **style)
+        upper.set(title=site, xlabel="noise at each node [cm]", xlim=(-0.25, max(noises) + 0.25), ylim=(0, 1.05))
+        lower.set(xlim=(-0.5, len(others) - 0.5))
+        words = [name.replace(" missing", "\nmissing") if name != clean else "clean" for name in others]
+        lower.set_xticks(range(len(others)), words)
+        for ax in (upper, lower):
+            ax.grid(alpha=0.3)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=len(styles), fontsize=9)
+    return figure
+
+
+def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
+    """Draws F1 against the time for all trajectories of a map.
+
+    points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
+    """
+    figure = Figure(figsize=(9, 5.6), layout="constrained")
+    ax = figure.subplots()
+    for number, (name, (seconds, clean, noisy)) in enumerate(points.items()):
+        ax.plot([seconds, seconds], [clean, noisy], "-", color=f"C{number}", alpha=0.4)
+        ax.plot(seconds, clean, "o", color=f"C{number}", label=f"{name}: {seconds:.3g} s")
+        ax.plot(seconds, noisy, "v", color=f"C{number}")
+    for marker, label in (("o", "clean map"), ("v", "at the largest noise, simulators after the best filter")):
+        ax.plot([], [], marker, color="0.4", label=label)
+    ax.set_xscale("log")
+    ax.set(
+        xlabel="s for all trajectories of a map",
+        ylabel=f"F1 at {THRESHOLD:g}, events pooled",
+        ylim=(0, 1.05),
+    )
+    ax.grid(alpha=0.3)
+    figure.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    return figure

@@ -9,9 +9,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from travjax import progress
-from travjax.commands import train
-from travjax.commands.evaluate import evaluate
+from travjax import options, progress
 from travjax.config import read_text
 from travjax.devices import Devices
 from travjax.estimators.names import RESNET
@@ -24,6 +22,8 @@ from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
 from travjax.signals import going_on
 from travjax.simulation.traverse import as_in_paper
+from travjax.training.evaluation_report import evaluate_run
+from travjax.training.fit import fit
 
 DESCRIPTION = (
     "Makes synthetic maps, trains the estimator on them and evaluates it on maps that it has not seen: the first half "
@@ -37,36 +37,36 @@ TRAINING = ("training", "inputs")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the experiment; returns the exit code, 2 for bad input."""
-    options = launch.parser("synthetic", DESCRIPTION)
-    options.add_argument(
+    parser = launch.parser("synthetic", DESCRIPTION)
+    parser.add_argument(
         "preset",
         nargs="?",
         default="laptop",
         metavar="PRESET",
         help="smoke, laptop or paper, or a .toml file (laptop)",
     )
-    train.add_run(options)
-    options.add_argument(
+    options.add_run(parser)
+    parser.add_argument(
         "--out", type=user_path, metavar="DIR", help="folder to write to (runs/synthetic/ and the preset's name)"
     )
-    return launch.launch(options, run, argv)
+    return launch.launch(parser, run, argv)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains as far as that is not done yet, evaluates, and writes the report."""
     path = find_preset(arguments.preset, RESNET)
-    wanted = train.run_of(Preset.load(path), arguments)
+    wanted = options.run_of(Preset.load(path), arguments)
     folder = arguments.out or Path("runs/synthetic") / path.stem
     with held(folder), going_on(launch.GOES_ON):
-        train.train(wanted, folder, Devices.all(), resume=True)
-        scores = evaluate(folder, out=folder / "evaluation")
+        fit(wanted, folder, Devices.all(), resume=True)
+        scores = evaluate_run(folder, out=folder / "evaluation")
         progress.wrote(
             launch.write_report(folder, f"Synthetic maps, preset {path.stem}", _pieces(wanted, scores, folder))
         )
 
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:
-    """Of the report."""
+    """Returns texts and figures of the report."""
     epochs = [row for row in read_rows(folder / "metrics.jsonl") if type(row.get("samples_per_s")) in (int, float)]
     steps = [f"{row['step']:,} steps, {row['samples_per_s']:,.0f} samples/s in the last epoch" for row in epochs[-1:]]
     trained = (
@@ -89,7 +89,7 @@ def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]
 
 
 def _beside_the_paper(wanted: Run, ours: Confusion) -> list[str]:
-    """One line over all events, if robot and action space are the paper's."""
+    """Returns one line over all events, if robot and action space are the paper's."""
     if not as_in_paper(wanted.robot, wanted.actions):
         return []
     shown = lambda value: "-" if math.isnan(value) else f"{value:.3f}"

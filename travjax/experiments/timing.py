@@ -11,8 +11,7 @@ from pathlib import Path
 
 import jax
 
-from travjax import progress
-from travjax.commands import options
+from travjax import options, progress
 from travjax.config import require
 from travjax.devices import Devices
 from travjax.estimators.names import RESNET
@@ -78,7 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and writes the table, a figure and the report."""
-    grid, robot, actions = options.configuration(arguments)
+    grid, robot, actions = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.batch > 0, "--batch", arguments.batch, "at least 1")
     Devices.all().check_batch(arguments.batch)
@@ -95,7 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
 def measured(
     robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
 ) -> list[dict]:
-    """A row for each way to all trajectories of a map, on the device at hand, with progress bars."""
+    """Measures each way to all trajectories of a map on the device at hand, with progress bars; returns the rows."""
     with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
         row = simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
@@ -117,7 +116,7 @@ def measured(
 
 
 def _of_paper() -> list[dict]:
-    """What the paper says."""
+    """Returns rows of what the paper says."""
     sequential = next(seconds for _, seconds in PAPER.values())
     trajectories = len(ActionSpace())
     return [
@@ -138,7 +137,7 @@ def _row(what: str, device: str, seconds: float, trajectories: int, sequential: 
 
 
 def _device() -> str:
-    """What JAX runs on."""
+    """Names what JAX runs on."""
     devices = jax.devices()
     if devices[0].platform == "cpu":
         return f"{simulator_benchmark.processor()}, {os.cpu_count()} cores"

@@ -11,14 +11,32 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from travjax import progress
-from travjax.commands import evaluate, train
+from travjax import options, progress
 from travjax.config import InputError, load_toml, read_json, read_text, require, to_json
+from travjax.data import dataset
+from travjax.data.build import build_from_sites
+from travjax.data.dataset import Dataset
+from travjax.data.provenance import SitesConfig
+from travjax.devices import Devices
 from travjax.estimators.names import ESTIMATORS, FIELD, RESNET
+from travjax.estimators.preset import Preset
+from travjax.estimators.trajectory_samples import TrajectorySamples
+from travjax.evaluation import map_figures
+from travjax.evaluation.dataset_tables import statistics_table
+from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import launch
+from travjax.experiments.stand_ins import StandIns, chosen_stand_ins
+from travjax.experiments.transfer_runs import IMAGENET, Transfer, TransferConfig, run_all
+from travjax.experiments.transfer_scores import Results, arms_table, events_table, results_json, transfer_figure
 from travjax.files import find_preset, held, put_back, save_text, user_path
+from travjax.runs.evaluator import Evaluator
+from travjax.runs.run import DATA, Run
 from travjax.signals import going_on
+from travjax.simulation.traverse import unpacked
+from travjax.training.evaluation_report import evaluate_run
+from travjax.training.fit import fit
 
 DESCRIPTION = (
     "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "
@@ -61,8 +79,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="folder of a training run on synthetic maps, instead of a new one",
     )
     synthetic = parser.add_argument_group("the synthetic model, unless a folder of it is given")
-    train.add_run(synthetic)
-    parser.set_defaults(of_synthetic={action.dest: action.default for action in synthetic._group_actions})
+    options.add_run(synthetic)
+    parser.set_defaults(of_synthetic={name: parser.get_default(name) for name in options.RUN_OPTIONS})
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -75,12 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
-    """The experiment of a preset in a folder that no other process uses."""
-    from travjax.devices import Devices
-    from travjax.evaluation.transfer_scores import Results
-    from travjax.experiments.stand_ins import chosen_stand_ins
-    from travjax.experiments.transfer_runs import Transfer, TransferConfig, run_all
-
+    """Runs the experiment of a preset in a folder that no other process uses."""
     config = load_toml(path, TransferConfig)
     sites = path.parent / user_path(config.sites)
     stand_ins = chosen_stand_ins(sites, out, arguments.stand_ins, arguments.data)
@@ -99,7 +112,7 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     _write(transfer, Results.from_rows(run_all(transfer, say)), out, stand_ins)
 
 
-def _require_same(out: Path, config) -> None:
+def _require_same(out: Path, config: TransferConfig) -> None:
     """Keeps the configuration in the folder, and refuses a folder with another one; its FILES may have moved."""
     path = out / "config.json"
     text = json.dumps(to_json(config), indent=1) + "\n"
@@ -119,57 +132,42 @@ def _without_files(settings: Any) -> Any:
     return {k: v for k, v in settings.items() if k not in FILES} if isinstance(settings, dict) else settings
 
 
-def _base(preset: Path, arguments: argparse.Namespace):
-    """The run of the synthetic model: that of the folder given, else that of the experiment."""
-    from travjax.estimators.preset import Preset
-    from travjax.runs.run import Run
-
+def _base(preset: Path, arguments: argparse.Namespace) -> Run:
+    """Returns the run of the synthetic model: that of the folder given, else that of the experiment."""
     if not arguments.synthetic:
-        return train.run_of(Preset.load(preset), arguments)
+        return options.run_of(Preset.load(preset), arguments)
     for name, default in arguments.of_synthetic.items():
         given = getattr(arguments, name)
         require(given == default, f"--{name}", given, "left out where --synthetic is given")
     return Run.load(arguments.synthetic)
 
 
-def _train_synthetic(base, folder: Path, devices) -> None:
+def _train_synthetic(base: Run, folder: Path, devices: Devices) -> None:
     """Trains and evaluates the synthetic model as far as that is not done."""
-    train.train(base, folder, devices, resume=True)
+    fit(base, folder, devices, resume=True)
     if not (folder / TABLES).exists():
-        evaluate.evaluate(folder)
+        evaluate_run(folder)
 
 
 TABLES = "evaluation/tables.txt"
 """Tables of `travjax evaluate` in the folder of a training run."""
 
 
-def _data(sites: Path, given: Path | None, base, out: Path, stand_ins):
-    """The data set of real maps: the one given, else that of the experiment, made if it is not there yet."""
-    from travjax.data import dataset
-    from travjax.runs.run import DATA
-
+def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: StandIns | None) -> Dataset:
+    """Returns the data set of real maps: the one given, else the experiment's, made if it is not there yet."""
     if given:
         return dataset.load(given)
     put_back(out / DATA)
     if (out / DATA / "dataset.json").exists():
         return dataset.load(out / DATA)
-    from travjax.commands.dataset import made_of_sites
-    from travjax.data.provenance import SitesConfig
-
     if stand_ins:
         stand_ins.write()
     config = stand_ins.sites if stand_ins else SitesConfig.load(sites)
-    return made_of_sites(config, base.robot, base.actions, base.grid, out / DATA)
+    return build_from_sites(config, base.robot, base.actions, base.grid, out / DATA)
 
 
-def _write(transfer, results, out: Path, stand_ins) -> None:
-    """Tables, figures, JSON and the report."""
-    from travjax.evaluation import map_figures, score_figures
-    from travjax.evaluation.dataset_tables import statistics_table
-    from travjax.evaluation.simulator_benchmark import machine
-    from travjax.evaluation.transfer_scores import arms_table, events_table, results_json
-    from travjax.experiments.transfer_runs import IMAGENET
-
+def _write(transfer: Transfer, results: Results, out: Path, stand_ins: StandIns | None) -> None:
+    """Prints tables, and writes figures, JSON and the report."""
     config, base = transfer.config, transfer.base
     kind = "stand-in" if stand_ins else "real"
     trained = "the heads, on frozen trunks," if config.frozen else "everything"
@@ -181,7 +179,7 @@ def _write(transfer, results, out: Path, stand_ins) -> None:
     for title, table in tables.items():
         print(f"\n{title}\n{table}")
     print()
-    figures = [map_figures.save(score_figures.transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
+    figures = [map_figures.save(transfer_figure(results, COLOURS, f"{kind} maps"), out / "f1.png")]
     if stand_ins:
         figures.append(map_figures.save(stand_ins.figure(), out / "stand_in_sites.png"))
     if config.shown_maps:
@@ -222,21 +220,15 @@ MEANING = (
 )
 
 
-def _samples(transfer) -> str:
-    """What an epoch is trained on."""
-    from travjax.estimators.trajectory_samples import TrajectorySamples
-
+def _samples(transfer: Transfer) -> str:
+    """Says what an epoch is trained on."""
     if transfer.base.preset.model == FIELD:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
     return f"{TrajectorySamples(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
-def _maps_figure(transfer):
-    """The synthetic model before and after training on real maps, over the truth, on windows of one site."""
-    from travjax.evaluation import map_figures
-    from travjax.runs.evaluator import Evaluator
-    from travjax.simulation.traverse import unpacked
-
+def _maps_figure(transfer: Transfer) -> Figure:
+    """Draws the synthetic model before and after training on real maps, over the truth, on windows of one site."""
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.from_run(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)

@@ -39,7 +39,7 @@ FIELD_ARMS = (SCRATCH, "synthetic")
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """The experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
+    """Describes the experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
 
     sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
     synthetic:  preset that trains the synthetic model
@@ -85,7 +85,7 @@ class TransferConfig:
 
 
 class Transfer:
-    """The runs of all arms, in a folder.
+    """Trains the runs of all arms, in a folder.
 
     base:      the synthetic model's run; synthetic: its folder, which is read when its arm begins
     held_out:  samples of the test maps of each site, at natural frequency
@@ -217,7 +217,7 @@ def _name(arm: str) -> str:
 
 
 def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
-    """Samples of the test maps of each site."""
+    """Returns samples of the test maps of each site."""
     test = dataset.maps_of("test")
     require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
     sites = list(dict.fromkeys(dataset.group[test].tolist()))
@@ -227,7 +227,7 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
 
 
 def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
-    """The rows of all runs by arm and seed, those of one seed after the other; on_run is told which one begins."""
+    """Returns the rows of all runs by arm and seed, trained one after the other; on_run is told which one begins."""
     results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
     for arm in transfer.arms:
         for seed in transfer.config.seeds:

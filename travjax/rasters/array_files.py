@@ -17,8 +17,8 @@ from typing import IO, Any
 import numpy as np
 
 from travjax.config import InputError, require
+from travjax.memory import require_memory
 from travjax.rasters.coordinates import require_metric_named
-from travjax.rasters.memory import require_memory
 from travjax.rasters.raster import InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 from travjax.rasters.reading_options import DemOptions
 from travjax.simulation.heights import require_close

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from travjax.config import InputError
-from travjax.rasters.memory import require_disk
+from travjax.memory import require_disk
 
 BEGINNING = 2**16
 """Bytes of a file that are looked at."""

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 
 from travjax.config import InputError, require
+from travjax.memory import require_memory
 from travjax.rasters.coordinates import name_of, parsed, require_height_unit_named, require_metric
 from travjax.rasters.formats import OTHERS
-from travjax.rasters.memory import require_memory
 from travjax.rasters.raster import HeightSource, InMetres, Raster, agreed_cell_size, is_real, marks_nothing
 from travjax.rasters.reading_options import DemOptions
 

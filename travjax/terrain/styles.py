@@ -215,6 +215,20 @@ def require_world(world: float | None) -> None:
         require_number("world", world, math.nextafter(1, 0), 1000, "a map size in metres from 1 to 1000")
 
 
+def world_note(world: float | None, grid: Grid) -> str | None:
+    """Returns a line on the map size that features of the grid's maps are derived from, where that is not plain.
+
+    Raises InputError for a bad world.
+    """
+    require_world(world)
+    if world is not None and world != grid.size:
+        return f"synthetic maps of {grid.size:g} m with the features of {world:g} m maps"
+    if grid.size == Grid().size:
+        return None
+    paper = f"a world of {Grid().size:g} m makes the ground of the paper's {Grid().size:g} m maps"
+    return f"synthetic maps of {grid.size:g} m: their features grow with the map; {paper}"
+
+
 @usual_flags()
 def elevation(
     params: TerrainParams, noise_seed, *, grid: Grid = Grid(), world: float | None = None

@@ -8,10 +8,12 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import numpy as np
 
+from travjax import progress
 from travjax.data.dataset import DatasetConfig, generate
 from travjax.data.sampling import Sampler, batches
 from travjax.devices import Devices
@@ -19,6 +21,8 @@ from travjax.estimators.inference import Placed, over_samples
 from travjax.estimators.kind import Batch
 from travjax.estimators.preset import TrainingConfig
 from travjax.estimators.trajectory_estimator import TrajectoryEstimator, sample_logits
+from travjax.evaluation import simulator_benchmark
+from travjax.files import output_folder
 from travjax.models.input_images import ImageSource
 from travjax.models.trajectory_resnet import create
 from travjax.models.variables import VARIABLES, split_model
@@ -61,7 +65,7 @@ class Bench:
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
-        """One row for each thing that is measured."""
+        """Yields one row for each thing that is measured."""
         yield self.inputs()
         yield self.training_step()
         try:
@@ -137,15 +141,26 @@ class Bench:
         }
 
 
+def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15) -> None:
+    """Measures inputs, a training step and all trajectories of a map; prints the table and writes it as TSV.
+
+    repeats: timed calls of which the median is taken
+    Raises InputError when nothing can be written to `out`.
+    """
+    folder = output_folder(out)
+    rows = list(progress.bar("network", 4, "row", iterable=Bench(robot, actions, grid, repeats).rows()))
+    simulator_benchmark.write_rows(with_ratio(rows), COLUMNS, folder / "network.tsv")
+
+
 def with_ratio(rows: list[dict]) -> list[dict]:
-    """The rows, the Flax step's with its time as a multiple of PyTorch's if that was measured."""
+    """Returns the rows, the Flax step's with its time as a multiple of PyTorch's if that was measured."""
     ms = {row["what"]: row["ms"] for row in rows}
     ratio = ms[FLAX] / ms[TORCH] if TORCH in ms else None
     return [row | {"ratio": ratio if row["what"] == FLAX else None} for row in rows]
 
 
 def torch_estimator():
-    """The estimator in PyTorch: (trunk, heads), for images in channels-last form."""
+    """Makes the estimator in PyTorch: (trunk, heads), for images in channels-last form."""
     import torch
     from torch import nn
 
@@ -180,7 +195,7 @@ def torch_estimator():
 
 
 def _torch_training(grid: Grid) -> Callable[[], object]:
-    """A training step of the PyTorch estimator on a fixed batch of random images."""
+    """Makes a training step of the PyTorch estimator on a fixed batch of random images."""
     import torch
     from torch import nn
 

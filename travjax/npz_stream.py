@@ -11,7 +11,7 @@ import numpy as np
 
 from travjax.config import InputError
 from travjax.files import atomic_write
-from travjax.rasters.memory import require_disk
+from travjax.memory import require_disk
 
 SMALL = 1024
 """Bytes an item up to which an array is held in memory; larger ones wait in a file without a name."""

@@ -1,4 +1,4 @@
-"""What came of the transfer experiment: scores of every arm, seed, epoch and held-out site, in tables and JSON.
+"""Scores of the transfer experiment: of every arm, seed, epoch and held-out site, in tables, JSON and a figure.
 
 Everything is made from the confusions that training wrote to metrics.jsonl, at a threshold of 0.5. Figures of several
 seeds are their mean and, after the sign, their standard deviation.
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from travjax.config import require
-from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, Confusion, json_ready
+from travjax.config import one_line, require
+from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, THRESHOLD, Confusion, json_ready
 from travjax.evaluation.tables import rows_table, with_notes
 
 ALL = "all held-out"
@@ -28,7 +29,7 @@ PAPER_BEST = {
 COUNTS = ("tn", "fp", "fn", "tp")
 
 Confusions = dict[str, dict[str, Confusion]]
-"""By site, ALL among them, and by event, "overall" among them."""
+"""Confusions by site, ALL among them, and by event, "overall" among them."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ class Epoch:
 
     @staticmethod
     def from_row(row: Mapping) -> "Epoch":
-        """From a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
+        """Reads a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
         allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
         require(_is_scored(row), "row of metrics.jsonl", row, allowed)
         sites = {
@@ -60,7 +61,7 @@ class Epoch:
 
 
 def _is_scored(row: Mapping) -> bool:
-    """Whether a row of metrics.jsonl holds counts of every event on each site, and a number from validation if any."""
+    """Tells whether a row holds counts of every event on each site, and a number from validation if any."""
     at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
     sites, precision = row.get("watched"), row.get("average_precision")
     if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
@@ -81,17 +82,17 @@ class ArmRun:
     epochs: tuple[Epoch, ...]
 
     def best(self, site: str) -> Epoch:
-        """The epoch of the largest F1, events pooled, on a held-out site: the paper's way, which looks at the test."""
+        """Returns the epoch of the largest pooled F1 on a held-out site: the paper's way, which looks at the test."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.held_out[site][OVERALL].f1))
 
     @property
     def chosen(self) -> Epoch:
-        """The epoch that is best on the validation windows, by average precision; its checkpoint is the run's best."""
+        """Returns the epoch of the best average precision on validation windows, whose checkpoint is the run's best."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.validation))
 
 
 def always_fails(counts: Confusion) -> Confusion:
-    """Of the predictor that says "fails" of every trajectory, on the samples of these counts."""
+    """Returns the counts of the predictor that says "fails" of every trajectory, on the same samples."""
     return Confusion(0, counts.tn + counts.fp, 0, counts.fn + counts.tp)
 
 
@@ -107,18 +108,18 @@ class Results:
 
     @staticmethod
     def from_rows(rows: Mapping[str, Mapping[int, Sequence[Mapping]]]) -> "Results":
-        """From the rows of every arm and seed."""
+        """Reads the rows of every arm and seed."""
         run = lambda part: ArmRun(tuple(Epoch.from_row(row) for row in part))
         return Results({arm: {seed: run(part) for seed, part in seeds.items()} for arm, seeds in rows.items()})
 
     @cached_property
     def _some(self) -> Confusions:
-        """Of any run: how many samples fail is the same in all."""
+        """Returns those of any run: how many samples fail is the same in all."""
         return next(iter(next(iter(self.arms.values())).values())).epochs[0].held_out
 
     @property
     def sites(self) -> list[str]:
-        """The held-out sites, and ALL if they are several."""
+        """Returns the held-out sites, and ALL if they are several."""
         return list(self._some)
 
     @property
@@ -127,24 +128,24 @@ class Results:
         return list(next(iter(self._some.values())))
 
     def always(self, site: str, event: str = OVERALL) -> Confusion:
-        """The predictor that says "fails" of every trajectory."""
+        """Returns the counts of the predictor that says "fails" of every trajectory."""
         return always_fails(self._some[site][event])
 
     def f1(self, arm: str, site: str) -> np.ndarray:
-        """F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
+        """Returns F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
         runs = self.arms[arm].values()
         return np.array([[epoch.held_out[site][OVERALL].f1 for epoch in run.epochs] for run in runs])
 
     def best(self, arm: str, site: str) -> list[Epoch]:
-        """The best epoch of each seed on a held-out site."""
+        """Returns the best epoch of each seed on a held-out site."""
         return [run.best(site) for run in self.arms[arm].values()]
 
     def chosen(self, arm: str) -> list[Epoch]:
-        """The epoch of each seed that is best on the validation windows."""
+        """Returns the epoch of each seed that is best on the validation windows."""
         return [run.chosen for run in self.arms[arm].values()]
 
     def first(self, arm: str) -> list[Epoch]:
-        """The first state of each seed."""
+        """Returns the first state of each seed."""
         return [run.epochs[0] for run in self.arms[arm].values()]
 
 
@@ -164,7 +165,7 @@ ARM_COLUMNS = {
 
 
 def arms_table(results: Results) -> str:
-    """For each held-out site: the predictor that always says "fails", each arm at its two epochs, and the paper's."""
+    """Returns a table: for each site the predictor "always fails", each arm at its two epochs, and the paper's."""
     rows: list[dict] = []
     for site in results.sites:
         always = results.always(site)
@@ -199,7 +200,7 @@ EVENT_COLUMNS = {
 
 
 def events_table(results: Results, arm: str) -> str:
-    """For each held-out site and event an arm untrained, at its best epoch and at validation's; the paper's below."""
+    """Returns a table: for each site and event an arm untrained, at its best and at validation's epoch; the paper's."""
     rows = []
     for site in results.sites:
         states = {"untrained": results.first(arm), "best epoch": results.best(arm, site)}
@@ -235,7 +236,7 @@ def _numbers(epochs: Iterable[Epoch]) -> str:
 
 
 def mean_and_spread(values: Sequence[float]) -> str:
-    """Mean and standard deviation of the seeds; a dash where a value is undefined."""
+    """Returns mean and standard deviation of the seeds; a dash where a value is undefined."""
     if any(math.isnan(value) for value in values):
         return "-"
     spread = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 and np.ptp(values) > 0 else ""
@@ -243,7 +244,7 @@ def mean_and_spread(values: Sequence[float]) -> str:
 
 
 def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
-    """Why figures of some events and sites in the rows of a table are a dash."""
+    """Says why figures of some events and sites in the rows of a table are a dash."""
     none = [
         f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
         for site in results.sites
@@ -255,7 +256,7 @@ def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
 
 
 def results_json(results: Results) -> dict:
-    """Everything, for results.json."""
+    """Returns everything, for results.json."""
 
     def run(one: ArmRun) -> dict:
         best = {site: one.best(site).number for site in results.sites}
@@ -264,3 +265,28 @@ def results_json(results: Results) -> dict:
     arms = {arm: {str(seed): run(one) for seed, one in seeds.items()} for arm, seeds in results.arms.items()}
     always = {site: {event: results.always(site, event) for event in results.events} for site in results.sites}
     return {"arms": arms, "always_fails": json_ready(always)}
+
+
+def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
+    """Draws F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+
+    arms: their colours; maps: what they are trained on
+    Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
+    """
+    figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
+    axes = np.atleast_1d(figure.subplots(1, len(results.sites), sharey=True))
+    for ax, site in zip(axes, results.sites, strict=True):
+        for arm in results.arms:
+            colour = arms[arm]
+            f1 = np.nan_to_num(results.f1(arm, site))
+            epochs = np.arange(f1.shape[1])
+            ax.fill_between(epochs, f1.min(axis=0), f1.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+            ax.plot(epochs, f1.mean(axis=0), "o-", color=colour, markersize=4, label=arm)
+        always = results.always(site)
+        ax.axhline(always.f1, color="0.4", linestyle="--", linewidth=1, label="always fails")
+        ax.set_title(f"{one_line(site, 40)}: {always.failures:.2%} of {always.samples:,} fail", fontsize=10)
+        ax.set(xlabel=f"epoch on {maps}", xticks=epochs, xlim=(-0.2, None), ylim=(0, 1))
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel(f"F1 at {THRESHOLD:g}, events pooled")
+    axes[0].legend(fontsize=9)
+    return figure

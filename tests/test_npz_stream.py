@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from travjax import memory
 from travjax.config import InputError
-from travjax.data.npz_stream import NpzStream
-from travjax.rasters import memory
+from travjax.npz_stream import NpzStream
 
 
 def batches() -> list[dict[str, np.ndarray]]:

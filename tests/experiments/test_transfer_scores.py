@@ -6,9 +6,19 @@ import math
 import numpy as np
 import pytest
 
+from tests.evaluation.test_map_figures import colours, pixels, within
+from tests.evaluation.test_score_figures import labelled_lines
 from tests.small_training import loads
 from travjax.evaluation.metrics import NAMES, Confusion, json_ready, with_overall
-from travjax.evaluation.transfer_scores import ALL, Results, arms_table, events_table, mean_and_spread, results_json
+from travjax.experiments.transfer_scores import (
+    ALL,
+    Results,
+    arms_table,
+    events_table,
+    mean_and_spread,
+    results_json,
+    transfer_figure,
+)
 
 SAFE = Confusion(10, 0, 0, 0)
 
@@ -138,3 +148,26 @@ def test_the_json_holds_every_epoch_and_can_be_read_by_any_reader():
     assert set(seed["epochs"][1]["held_out"]["hill"]) == set(NAMES)
     assert seed["epochs"][0]["held_out"]["hill"]["step"]["f1"] is None
     assert made["always_fails"]["hill"]["obstacle"]["tp"] == 4
+
+
+# ---- The figure
+
+
+def test_the_f1_of_each_arm_is_drawn_with_the_band_of_its_seeds_and_the_predictor_that_always_fails(tmp_path):
+    rows = results().arms["random"]
+    made = Results({"random": rows, "ImageNet": {0: rows[1]}})
+    figure = transfer_figure(made, {"random": "tab:gray", "ImageNet": "tab:blue"})
+    image = pixels(figure, tmp_path)
+    assert [ax.get_title().split(":")[0] for ax in figure.axes] == made.sites
+    for ax, site in zip(figure.axes, made.sites, strict=True):
+        drawn = labelled_lines(ax)
+        f1 = made.f1("random", site)
+        np.testing.assert_allclose(drawn["random"], ([0, 1, 2], f1.mean(axis=0)))
+        np.testing.assert_allclose(drawn["ImageNet"][1], f1[1])
+        assert set(drawn["always fails"][1]) == {made.always(site).f1}
+        band = ax.collections[0].get_paths()[0].vertices
+        for epoch in range(3):
+            edges = band[band[:, 0] == epoch, 1]
+            assert (edges.min(), edges.max()) == pytest.approx((f1[:, epoch].min(), f1[:, epoch].max()))
+        assert colours(within(ax, image)) > 20
+    assert [text.get_text() for text in figure.axes[0].get_legend().get_texts()] == [*made.arms, "always fails"]

@@ -2,8 +2,8 @@
 
 import pytest
 
+from travjax import memory
 from travjax.config import InputError
-from travjax.rasters import memory
 
 
 def test_what_is_there_is_some_memory_and_no_more_than_the_machine_has():

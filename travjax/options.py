@@ -1,31 +1,41 @@
-"""What commands share: groups of options, the configurations they make, and progress."""
+"""The options that commands and experiments share: groups of them, and the typed values that they stand for."""
 
 import argparse
-import dataclasses
-import json
-from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from travjax.config import InputError, require, to_json
-from travjax.data.map_batches import Batch
+from travjax.config import require
+from travjax.data.map_batches import MapStream, WindowOptions
 from travjax.files import user_path
-from travjax.progress import bar
 from travjax.rasters.reading_options import AXES_UP, DemOptions
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import load_setup
 from travjax.terrain.rock_field import STYLE as ROCK_FIELD
-from travjax.terrain.styles import STYLES, are_rock_fields, require_world
+from travjax.terrain.styles import STYLES
 
-Commands = argparse._SubParsersAction
-"""What `add(commands)` of a command adds its parser to."""
+if TYPE_CHECKING:  # these take seconds to import
+    from travjax.estimators.preset import Preset
+    from travjax.runs.run import Run
+
+
+class Commands(Protocol):
+    """What `add(commands)` of a command adds its parser to."""
+
+    def add_parser(self, name: str, *, help: str, description: str) -> argparse.ArgumentParser:
+        """Returns a new parser for a command."""
+
+
+class Options(Protocol):
+    """A parser, or a group of its options."""
+
+    def add_argument(self, *names: str, **settings: Any) -> argparse.Action:
+        """Adds an option."""
 
 
 def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> None:
-    """Styles, number and seed of synthetic maps; see `styles`, `count` and `seed`."""
+    """Adds styles, number and seed of synthetic maps; see `maps`, `count` and `seed`."""
     parser.add_argument(
         "--style",
         nargs="+",
@@ -40,7 +50,7 @@ def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> Non
 
 
 def add_world(parser: argparse.ArgumentParser) -> None:
-    """The world of synthetic maps; see `say_world`."""
+    """Adds the world of synthetic maps; see `MapStream`."""
     parser.add_argument(
         "--world",
         type=float,
@@ -51,7 +61,7 @@ def add_world(parser: argparse.ArgumentParser) -> None:
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Robot and action space; see `configuration`."""
+    """Adds robot and action space; see `setup`."""
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
@@ -61,12 +71,29 @@ GROWS = "features of synthetic maps grow with it, unless a world is given"
 """What a map's edge does."""
 
 
-def add_grid(parser: argparse._ActionsContainer) -> None:
-    """Size and spacing of maps; see `configuration`."""
+def add_grid(parser: Options) -> None:
+    """Adds size and spacing of maps; see `setup`."""
     parser.add_argument("--size", type=float, default=8.0, metavar="M", help=f"edge of a map in metres (8); {GROWS}")
     parser.add_argument(
         "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
     )
+
+
+RUN_OPTIONS = ("robot", "actions", "size", "spacing", "weights", "seed")
+"""What `add_run` adds."""
+
+
+def add_run(parser: Options) -> None:
+    """Adds what of a run may differ from its preset; see `run_of`."""
+    parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
+    parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    add_grid(parser)
+    parser.add_argument(
+        "--weights",
+        metavar="FILE",
+        help="the trunk's first weights, or none for random ones (ImageNet's: TRAVJAX_DATA, the cache, else fetched)",
+    )
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of data set and training, instead of the preset's")
 
 
 DEM_OPTIONS = (
@@ -77,7 +104,7 @@ DEM_OPTIONS = (
 
 
 def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
-    """How elevation maps are read; see `dem_settings`."""
+    """Adds how elevation maps are read; see `windows`."""
     parser.add_argument("--stride", type=float, metavar="M", help=f"metres between windows of a DEM ({stride:g})")
     parser.add_argument(
         "--cell-size", type=float, metavar="M", help="metres between a DEM's values, or into which points are put"
@@ -124,47 +151,34 @@ def _codes(text: str) -> tuple[int, ...]:
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    """The folder to write to."""
+    """Adds the folder to write to."""
     parser.add_argument(
         "--out", type=user_path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})"
     )
 
 
-def styles(arguments: argparse.Namespace, grid: Grid) -> list[str]:
-    """Returns the styles of synthetic maps; says what maps their features are those of, and refuses a bad world."""
-    styles = arguments.style or list(STYLES)
-    if not are_rock_fields(styles, arguments.world):
-        say_world(arguments.world, grid)
-    return styles
-
-
 def count(arguments: argparse.Namespace) -> int:
-    """The number of synthetic maps."""
+    """Returns the number of synthetic maps."""
     count = arguments.default_count if arguments.count is None else arguments.count
     require(count > 0, "--count", count, "at least 1")
     return count
 
 
 def seed(arguments: argparse.Namespace) -> int:
-    """The seed of the first synthetic map."""
+    """Returns the seed of the first synthetic map."""
     seed = arguments.seed or 0
     require(0 <= seed < 2**31, "--seed", seed, f"from 0 to {2**31 - 1}")
     return seed
 
 
-def say_world(world: float | None, grid: Grid) -> None:
-    """Prints what maps the features of synthetic maps are those of, where that is not plain; refuses a bad world."""
-    require_world(world)
-    if world is not None and world != grid.size:
-        print(f"synthetic maps of {grid.size:g} m with the features of {world:g} m maps")
-    elif grid.size != Grid().size:
-        paper = f"a world of {Grid().size:g} m makes the ground of the paper's {Grid().size:g} m maps"
-        print(f"synthetic maps of {grid.size:g} m: their features grow with the map; {paper}")
+def setup(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
+    """Returns grid, robot and action space; refuses what does not fit together before anything is made."""
+    return load_setup(arguments.robot, arguments.actions, arguments.size, arguments.spacing)
 
 
-def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:
-    """How elevation maps are read, as `load_dem` takes it: by keyword, `stride` included."""
-    options = DemOptions(
+def windows(arguments: argparse.Namespace) -> WindowOptions:
+    """Returns how elevation maps are read and cut into windows."""
+    reading = DemOptions(
         arguments.cell_size,
         arguments.height_scale,
         arguments.nodata,
@@ -173,34 +187,29 @@ def dem_settings(arguments: argparse.Namespace) -> dict[str, Any]:
         arguments.up,
         tuple(arguments.gdal_driver or ()),
     )
-    return dataclasses.asdict(options) | {
-        "stride": arguments.default_stride if arguments.stride is None else arguments.stride,
-        "fill_holes": not arguments.keep_holes,
-        "allow_coarse": arguments.allow_coarse,
-    }
+    stride = arguments.default_stride if arguments.stride is None else arguments.stride
+    return WindowOptions(reading, stride, not arguments.keep_holes, arguments.allow_coarse)
 
 
-def configuration(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
-    """Grid, robot and action space; refuses what does not fit together before anything is made."""
-    grid, robot = Grid(arguments.size, arguments.spacing), Robot.load(arguments.robot)
-    actions = ActionSpace.load(arguments.actions) if arguments.actions else ActionSpace()
-    try:
-        node_table(robot, actions, grid)
-    except InputError as error:
-        given = [str(source) for source in (arguments.robot, arguments.actions) if source]
-        raise InputError(f"{' with '.join(given)}: {error}") from None
-    return grid, robot, actions
+def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:
+    """Returns the windows of elevation maps, or synthetic maps where no file is given; prints what they are."""
+    unused = ("style", "count", "seed", "world") if arguments.dem else DEM_OPTIONS
+    for name in unused:
+        given = getattr(arguments, name)
+        allowed = "left out where DEM files are given" if arguments.dem else "left out where no DEM file is given"
+        require(given is None or given is False, f"--{name.replace('_', '-')}", given, allowed)
+    if arguments.dem:
+        return MapStream.from_files(arguments.dem, grid, windows(arguments), print)
+    total, first = count(arguments), seed(arguments)
+    return MapStream.synthetic(
+        arguments.style or list(STYLES), range(first, first + total), grid, arguments.world, print
+    )
 
 
-def configuration_json(robot: Robot, actions: ActionSpace, grid: Grid, **more: Any) -> str:
-    """All that labels depend on, as JSON, with the version of travjax; a straight arc's radius is "inf"."""
-    parts = {name: to_json(part) for name, part in (("robot", robot), ("actions", actions), ("grid", grid))}
-    return json.dumps(parts | more | {"travjax": version("travjax")}, allow_nan=False)
+def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
+    """Returns the run of a preset with what RUN_OPTIONS let differ from it."""
+    from travjax.training.fit import run_from_preset
 
-
-def progress(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]:
-    """The batches, with a bar that counts their maps."""
-    with bar(what, total, "map") as shown:
-        for batch in batches:
-            yield batch
-            shown.update(len(batch["heights"]))
+    if arguments.seed is not None:
+        seed(arguments)
+    return run_from_preset(preset, **{name: getattr(arguments, name) for name in RUN_OPTIONS})

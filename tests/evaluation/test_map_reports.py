@@ -1,0 +1,36 @@
+"""Maps that are made and labelled by a call; what is said of them is in tests/test_cli.py."""
+
+import json
+
+import numpy as np
+
+from tests.commandline import FEW, files
+from travjax.data.map_batches import MapStream
+from travjax.evaluation.map_reports import label_maps, write_terrain
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.traverse import failures, simulate
+from travjax.terrain.styles import generate_terrain
+
+HUSKY, GRID = Robot.load("husky_a200"), Grid(4, 0.125)
+
+
+def test_terrain_is_written_with_a_sheet_of_each_style(tmp_path):
+    path = write_terrain(["rough", "smooth"], range(3, 5), GRID, str(tmp_path / "out"), world=8.0)
+    assert files(path.parent) == {path, *(path.with_name(f"terrain_{style}.png") for style in ("rough", "smooth"))}
+    with np.load(path) as made:
+        assert made["seed"].tolist() == [3, 4, 3, 4] and made["world"] == 8.0
+        heights = generate_terrain(["rough", "rough", "smooth", "smooth"], [3, 4, 3, 4], grid=GRID, world=8.0)
+        np.testing.assert_array_equal(made["heights"], heights)
+
+
+def test_labels_are_written_with_all_that_they_depend_on(tmp_path, capsys):
+    maps = MapStream.synthetic(["rough"], [3, 4], GRID, 8.0)
+    path = label_maps(maps, HUSKY, FEW, GRID, tmp_path, figures=False)
+    assert files(tmp_path) == {path, tmp_path / "shares.txt"}
+    with np.load(path) as labels:
+        margins = simulate(labels["heights"], HUSKY, FEW, grid=GRID)
+        np.testing.assert_array_equal(labels["failed"], failures(margins, HUSKY))
+        config = json.loads(str(labels["config"]))
+    assert (config["world"], config["files"], config["robot"]["name"]) == (8.0, [], HUSKY.name)
+    assert (tmp_path / "shares.txt").read_text() in capsys.readouterr().out

@@ -1,0 +1,70 @@
+"""Building a data set in a folder: of synthetic maps, or of the windows of real sites."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from travjax import progress
+from travjax.config import InputError, require
+from travjax.data import sites
+from travjax.data.dataset import Dataset, DatasetConfig, Progress, generate, is_dataset, save
+from travjax.data.provenance import SitesConfig
+from travjax.files import output_folder, put_back, resolved, user_path
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.terrain.styles import world_note
+
+
+def build_synthetic(
+    config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: str | Path
+) -> Dataset:
+    """Makes and labels synthetic maps, and saves the data set in a folder, with progress bars.
+
+    A data set that lies there is replaced. Raises InputError when robot, actions and grid do not fit together, when the
+    maps do not fit in memory, and when something else lies there or the data set cannot be written.
+    """
+    if note := world_note(config.world, grid):
+        progress.say(note)
+    make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
+    return _saved(make, config.maps, user_path(folder), f"--maps = {config.maps}")
+
+
+def build_from_sites(
+    config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: str | Path
+) -> Dataset:
+    """Cuts the windows of real sites, labels them, and saves the data set in a folder, with progress bars.
+
+    Raises InputError as `build_synthetic` does, and when a file is missing, cannot be read or leaves no window.
+    """
+    make = lambda on_progress: sites.read(config, robot, actions, grid, on_progress)
+    return _saved(make, None, user_path(folder), "the sites' windows")
+
+
+def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path, what: str) -> Dataset:
+    """Saves what `make` makes and returns it; total: number of maps, if that is known before."""
+    _require_free(folder)
+    try:
+        with progress.bar("making", total, "map", delay=0.1) as bar:  # none where a file is refused at once
+            dataset = make(bar.update)
+    except MemoryError as error:
+        raise InputError(f"{what}: do not fit in memory: {error}") from None
+    size = sum(array.nbytes for array in dataset.arrays.values())
+    with progress.bar("saving", size, "B", unit_scale=True) as bar:
+        # The files' headers are not in the total.
+        save(dataset, folder, lambda added: bar.update(min(added, size - bar.n)))
+    return dataset
+
+
+def _require_free(folder: Path) -> None:
+    """Refuses, before minutes of work, what `save` would refuse after them, and to replace the working folder."""
+    require(resolved(folder) != Path.cwd(), "--out", str(folder), "another folder than the one you are in")
+    put_back(folder)
+    try:
+        empty = not folder.exists() or folder.is_dir() and not any(folder.iterdir())
+    except OSError as error:
+        raise InputError(f"--out {folder}: cannot be read: {error.strerror or error}") from None
+    if not empty and not is_dataset(folder):
+        raise InputError(f"--out {folder}: holds something else: must be a new or empty folder, or that of a data set")
+    if not empty:
+        progress.say(f"{folder}: the data set there will be replaced")
+    output_folder(folder.parent)

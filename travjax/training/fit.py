@@ -1,0 +1,155 @@
+"""Fitting an estimator: from a preset to a trained run in a folder, which goes on where it was interrupted."""
+
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from travjax import progress
+from travjax.config import InputError, one_line, require
+from travjax.data import dataset
+from travjax.data.build import build_synthetic
+from travjax.data.dataset import Dataset
+from travjax.devices import Devices
+from travjax.estimators.preset import Preset, find_weights
+from travjax.evaluation import map_figures, score_figures
+from travjax.files import held, output_folder, put_back, user_path
+from travjax.jax_flags import usual_flags
+from travjax.models.input_images import render_inputs
+from travjax.resnet.imagenet_weights import load_weights
+from travjax.runs.run import DATA, Run, has_checkpoints
+from travjax.runs.run_log import read_rows
+from travjax.simulation.setup import load_setup
+from travjax.training.trainer import Trainer
+
+
+def run_from_preset(
+    preset: Preset | str | Path,
+    *,
+    robot: str | None = None,
+    actions: str | Path | None = None,
+    size: float = 8.0,
+    spacing: float = 0.0625,
+    weights: str | None = None,
+    seed: int | None = None,
+) -> Run:
+    """Returns the run of a preset, with what is to differ from it.
+
+    preset:  a preset, or its TOML file
+    robot, actions, size, spacing: as `load_setup` takes them; the preset's robot unless given
+    weights: file of the trunk's first weights, or "none"
+    seed:    of data set and training
+    Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
+    seed that cannot be.
+    """
+    preset = preset if isinstance(preset, Preset) else Preset.load(preset)
+    if weights:
+        preset = replace(preset, weights=weights)
+    if seed is not None:
+        preset = replace(
+            preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
+        )
+    preset = replace(preset, robot=robot or preset.robot)
+    grid, loaded, space = load_setup(preset.robot, actions, size, spacing)
+    return Run(preset, loaded, space, grid)
+
+
+@usual_flags()
+def fit(
+    run: Run,
+    folder: str | Path,
+    devices: Devices | None = None,
+    data: str | Path | None = None,
+    resume: bool = False,
+    option: str = "--out",
+) -> None:
+    """Trains a run in a folder, and prints what it writes there.
+
+    devices: to train on, all unless given
+    data:    folder of its data set, instead of one made by the preset
+    resume:  goes on with the run that the folder holds, if it holds one
+    option:  what a message calls a folder that holds another run
+    Raises InputError before it trains: another process works in the folder, it holds a run that differs or is not to be
+    gone on with, first weights or data set are missing or damaged or do not fit.
+    """
+    devices, place = devices or Devices.all(), user_path(folder)
+    with held(place) if devices.main else nullcontext():
+        _fit(run, place, devices, data, resume, option)
+
+
+def _fit(wanted: Run, folder: Path, devices: Devices, data: str | Path | None, resume: bool, option: str) -> None:
+    """Trains a run in a folder that no other process uses."""
+    preset = wanted.preset
+    resumes = has_checkpoints(folder)
+    if resumes:
+        _check_folder(folder, wanted, resume, option)
+    devices.wait()
+    file = None if resumes else find_weights(preset.weights)
+    weights = load_weights(file, preset.trunk) if file else None
+    estimator = None if resumes else wanted.create(preset.training.seed, weights)
+    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices)
+    output_folder(folder)
+    if devices.main:
+        wanted.save(folder)
+        progress.say(one_line(trainer.summary()))
+    if estimator is None:
+        trainer.resume()
+    else:
+        trainer.start(estimator)
+        if devices.main and wanted.kind.sees_images:
+            progress.wrote(_draw_inputs(trainer, folder))
+    trainer.train()
+    if devices.main:
+        _finish(folder)
+
+
+def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
+    """Raises InputError where a run would be overwritten, or continued with other settings."""
+    if not resume:
+        raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
+    Run.load(folder).require_same_settings(wanted, f"{option} {folder}")
+
+
+def _dataset(data: str | Path | None, wanted: Run, folder: Path, devices: Devices) -> Dataset:
+    """Returns the data set that is given, else the run's own, which is made if it is not there yet."""
+    if data:
+        return dataset.load(data)
+    kept, config = folder / DATA, wanted.preset.dataset
+    put_back(kept)
+    for split, size in zip(dataset.SPLITS[:2], config.split_sizes()[:2], strict=True):
+        require(size > 0, f"the preset's [dataset]: {split} maps", size, "at least 1: more maps, other shares")
+    if devices.main and not (kept / "dataset.json").exists():
+        build_synthetic(config, wanted.robot, wanted.actions, wanted.grid, kept)
+    devices.wait()
+    loaded = dataset.load(kept)
+    made_anew = "remove it to have it made anew, or take another --out"
+    require(loaded.config == config, f"data set {kept}", loaded.config, f"made from {config}; {made_anew}")
+    return loaded
+
+
+def _draw_inputs(trainer: Trainer, folder: Path) -> Path:
+    """Draws the three channels of a few training samples."""
+    samples, data, run = trainer.data.samples(2, 0), trainer.data.dataset, trainer.run
+    chosen = np.linspace(0, len(samples[0]) - 1, 4).astype(int)
+    maps, trajectories = (index[chosen] for index in samples)
+    scale = run.preset.elevation_scale
+    images = render_inputs(
+        data.heights[maps], np.arange(4), trajectories, run.robot, run.actions, grid=run.grid, elevation_scale=scale
+    )
+    titles = [
+        f"{one_line(group, 30)}, trajectory {index}"
+        for group, index in zip(data.group[maps], trajectories, strict=True)
+    ]
+    return map_figures.save(
+        score_figures.input_channels_figure(np.asarray(images), titles, run.grid), folder / "inputs.png"
+    )
+
+
+def _finish(folder: Path) -> None:
+    """Draws the figure of the run, and prints where everything is."""
+    rows, events = folder / "metrics.jsonl", Run.load(folder).robot.event_names
+    progress.say("")
+    for path in (folder / "checkpoints", rows, folder / "tensorboard"):
+        progress.wrote(path)
+    progress.wrote(map_figures.save(score_figures.training_figure(read_rows(rows), events), folder / "training.png"))
