@@ -131,9 +131,9 @@ def frames(path: Path) -> None:
     draw_robot(ax, robot)
     ax.annotate("", (0, 1.9), (0, 0.6), arrowprops={"arrowstyle": "-", "color": PALE, "linestyle": ":"})
     turn = np.linspace(0, actions.heading(2), 40)
-    ax.plot(-1.7 * np.sin(turn), 1.7 * np.cos(turn), color=INK, linewidth=1)
-    ax.annotate("", (-1.7 * np.sin(turn[-1]), 1.7 * np.cos(turn[-1])), (-1.7 * np.sin(turn[-3]), 1.7 * np.cos(turn[-3])),
-                arrowprops={"arrowstyle": "-|>", "color": INK})  # fmt: skip
+    swept = 1.7 * np.stack([-np.sin(turn), np.cos(turn)], axis=-1)
+    ax.plot(*swept.T, color=INK, linewidth=1)
+    ax.annotate("", swept[-1], swept[-3], arrowprops={"arrowstyle": "-|>", "color": INK})
     ax.text(0.15, 1.75, "heading, anticlockwise\nfrom +y")
     junction = len(actions.first_stations()) - 1
     for part, colour in ((poses[: junction + 1], "#c8431b"), (poses[junction:], "#35105e")):
@@ -150,7 +150,7 @@ def frames(path: Path) -> None:
         ]
     ):
         ax.text(4.3, 2.3 - 0.55 * place, text, color=colour, va="center")
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Date": None})
 
 
 def packages(path: Path) -> None:
@@ -172,7 +172,7 @@ def packages(path: Path) -> None:
         ax.add_patch(FancyBboxPatch((left + 0.1, row + 0.1), width - 0.2, 0.8, **style))
         ax.text(left + width / 2, row + 0.62, name, ha="center", va="center", weight="bold", color=INK)
         ax.text(left + width / 2, row + 0.32, text, ha="center", va="center", fontsize=9, color="#444444")
-    figure.savefig(path)
+    figure.savefig(path, metadata={"Date": None})
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import doctest
 import re
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -110,3 +111,36 @@ HEADLINES = {
 def test_figures_of_the_readme_stand_in_their_records(record):
     text = (ROOT / record).read_text()
     assert all(figure in text for figure in HEADLINES[record])
+
+
+def test_a_docstring_becomes_a_list_of_its_names_and_keeps_its_prose():
+    to_rest = runpy.run_path(str(ROOT / "docs/docstrings.py"))["to_rest"]
+    docstring = """Returns *n of `max_step`, a_b.
+
+heights: [n, rows] metres,
+         NaN unknown
+left, right
+robot:   a Robot
+Returns [n] arrays.
+Raises InputError.
+
+    code = 1"""
+    lines = [line for line in to_rest(docstring.split("\n")) if line]
+    assert lines == [
+        r"Returns \*n of ``max_step``, a\_b.",
+        "- **heights**: [n, rows] metres, NaN unknown",
+        "- **left, right**",
+        "- **robot**: a Robot",
+        "Returns [n] arrays.",
+        "Raises InputError.",
+        ".. code-block:: text",
+        "    code = 1",
+    ]
+
+
+def test_links_between_pages_of_the_site_lead_to_pages_and_others_to_files():
+    records = runpy.run_path(str(ROOT / "docs/records.py"))
+    text = "[a](BUILD_NOTES.md#decisions) [b](docs/start.md) ![c](docs/images/frames.svg) [d](examples) [e](https://x.y/z.md)"
+    made = records["with_links_between_pages"](text, README, ROOT / "docs/records/README.md")
+    expected = "[a](BUILD_NOTES.md#decisions) [b](../start.md) ![c](../images/frames.svg) d [e](https://x.y/z.md)"
+    assert made == expected

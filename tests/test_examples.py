@@ -18,8 +18,8 @@ maps = 6
 validation = 0.2
 test = 0.2
 [field]
-stem = 2
-widths = [2]
+stem = 1
+widths = [1]
 channels = 2
 hidden = 4
 [training]
@@ -62,10 +62,11 @@ def test_every_example_is_tested():
 
 def test_a_dem_is_labelled(capsys):
     module = example("label_dem")
-    module.main()
-    assert words(capsys.readouterr().out) == words("\n".join(lines_said(module)))
+    module.main(stride=16.0)
+    out = capsys.readouterr().out
+    assert out.startswith("4 windows") and words(out) == words("\n".join(lines_said(module)))
     module.main("runs/examples/site.npz", stride=16.0)
-    assert capsys.readouterr().out.startswith("4 windows")
+    assert capsys.readouterr().out == out
 
 
 def test_a_robot_of_ones_own_fails_less_with_more_clearance(capsys):
@@ -79,7 +80,7 @@ def test_a_robot_of_ones_own_fails_less_with_more_clearance(capsys):
 
 def test_a_figure_of_the_paper_is_drawn(capsys):
     module = example("paper_figure")
-    assert module.main(every=30).stat().st_size > 10_000
+    assert module.main(every=100).stat().st_size > 10_000
     assert words(capsys.readouterr().out) == words("\n".join(lines_said(module)[:-1]))
 
 
