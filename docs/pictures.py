@@ -24,14 +24,19 @@ COLOURS = {"safe": "#c9e8f7", "obstacle": "#f0a500", "step": "#c8431b", "tilt": 
 INK, PALE, SHADE = "#222222", "#8a8a8a", "#d9d9d9"
 
 PACKAGES = [
-    [("training", "one trainer, one step"), ("experiments", "the paper's, and others")],
-    [("runs", "a run on disk, predictors")],
-    [("models", "ResNet50, hazard field"), ("evaluation", "scores, tables, figures")],
-    [("data", "windows, samples, splits"), ("resnet", "network, ImageNet weights")],
-    [("terrain", "synthetic ground"), ("point_clouds", "LAS, PLY, PCD, meshes")],
-    [("rasters", "GeoTIFF and others"), ("simulation", "grid, robot, margins")],
+    {"experiments": "the paper's experiments, and a comparison"},
+    {"commands": "one module a command: parse, call the library, print"},
+    {"training": "the trainer and its step, evaluation on test maps"},
+    {"runs": "a run on disk, predictors", "evaluation": "scores, tables, figures"},
+    {"data": "windows of real sites, samples, splits, data sets"},
+    {"point_clouds": "LAS, LAZ, PLY, PCD, text, meshes"},
+    {"terrain": "synthetic ground", "rasters": "GeoTIFF and others", "models": "ResNet50, hazard field"},
+    {"simulation": "grid, robot, actions, margins", "resnet": "network, ImageNet weights"},
 ]
-"""Packages from the top to the bottom, and what each holds."""
+"""Packages and what each holds, in rows: each imports only from rows below its own."""
+
+FOUNDATION = "config, files, devices, batching, jax_flags, signals, progress"
+"""Modules of travjax itself, on which all packages stand."""
 
 
 def overview(path: Path) -> None:
@@ -154,24 +159,20 @@ def frames(path: Path) -> None:
 
 
 def packages(path: Path) -> None:
-    """Draws the packages: each imports only from rows below its own, or from its left in the same row."""
-    figure = Figure(figsize=(7.4, 5), layout="constrained")
+    """Draws the packages in rows, over the modules on which all stand."""
+    rows = [*PACKAGES, {FOUNDATION: "what everything stands on"}]
+    figure = Figure(figsize=(7.4, 0.62 * len(rows)), layout="constrained")
     ax = figure.subplots()
-    ax.set(xlim=(0, 10), ylim=(-0.1, len(PACKAGES) + 2.1))
+    ax.set(xlim=(0, 10), ylim=(-len(rows), 0))
     ax.axis("off")
-    wide = [
-        (0, "config, files, devices, batching, jax_flags, signals, progress", "what everything stands on"),
-        (len(PACKAGES) + 1, "commands, cli", "one module a command: parse, call the library, print"),
-    ]
-    boxes = [(0.0, 10.0, row, name, text) for row, name, text in wide]
-    for row, names in enumerate(reversed(PACKAGES), start=1):
-        width = 10 / len(names)
-        boxes += [(place * width, width, row, name, text) for place, (name, text) in enumerate(names)]
-    for left, width, row, name, text in boxes:
-        style = {"boxstyle": "round,pad=0,rounding_size=0.12", "facecolor": "#eef4f8", "edgecolor": INK}
-        ax.add_patch(FancyBboxPatch((left + 0.1, row + 0.1), width - 0.2, 0.8, **style))
-        ax.text(left + width / 2, row + 0.62, name, ha="center", va="center", weight="bold", color=INK)
-        ax.text(left + width / 2, row + 0.32, text, ha="center", va="center", fontsize=9, color="#444444")
+    for row, texts in enumerate(rows, start=1):
+        width = 10 / len(texts)
+        for place, (name, text) in enumerate(texts.items()):
+            middle = width * (place + 0.5)
+            style = {"boxstyle": "round,pad=0,rounding_size=0.12", "facecolor": "#eef4f8", "edgecolor": INK}
+            ax.add_patch(FancyBboxPatch((width * place + 0.1, 0.1 - row), width - 0.2, 0.8, **style))
+            ax.text(middle, 0.65 - row, name, ha="center", va="center", weight="bold", color=INK)
+            ax.text(middle, 0.32 - row, text, ha="center", va="center", fontsize=9, color="#444444")
     figure.savefig(path, metadata={"Date": None})
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.test_layering import LAYERS, MODULES, PACKAGE, imports_of
+
 ROOT = Path(__file__).parents[1]
 MADE = {"_build", "api", "records"}
 """Folders of docs/ that building the site fills."""
@@ -144,3 +146,14 @@ def test_links_between_pages_of_the_site_lead_to_pages_and_others_to_files():
     made = records["with_links_between_pages"](text, README, ROOT / "docs/records/README.md")
     expected = "[a](BUILD_NOTES.md#decisions) [b](../start.md) ![c](../images/frames.svg) d [e](https://x.y/z.md)"
     assert made == expected
+
+
+def test_packages_of_the_drawing_import_only_from_rows_below():
+    rows = runpy.run_path(str(ROOT / "docs/pictures.py"))["PACKAGES"]
+    row_of = {name: row for row, names in enumerate(reversed(rows)) for name in names}
+    assert set(row_of) == set(LAYERS) - {"", "program"}
+    for module in MODULES:
+        package = module.split(".")[0]
+        if package in row_of and not module.endswith("__init__"):
+            used = {name.split(".")[0] for name in imports_of((PACKAGE / f"{module.replace('.', '/')}.py").read_text())}
+            assert all(row_of[name] < row_of[package] for name in used & set(row_of) - {package})
