@@ -12,7 +12,7 @@ YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
 export TRAVJAX_DATA
 
 .DEFAULT_GOAL := help
-.PHONY: help setup label train test check bench clean
+.PHONY: help setup label train test check bench docs clean
 
 help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
@@ -24,6 +24,7 @@ help:
 	@echo "make test    run the tests"
 	@echo "make check   lint, types and layering"
 	@echo "make bench   measure speed, into $(OUT)/bench"
+	@echo "make docs    build the documentation, into docs/_build/html"
 	@echo "make clean   remove $(VENV), $(OUT) and caches"
 
 setup: $(VENV)/.ready
@@ -72,5 +73,13 @@ bench: setup
 	$(BIN)/travjax bench --out $(OUT)/bench
 	GLIBC_TUNABLES=glibc.malloc.hugetlb=1 $(BIN)/travjax bench --network --out $(OUT)/bench
 
+$(VENV)/.docs: $(VENV)/.ready
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs docs/_build/html
+	@echo "The documentation is in docs/_build/html/index.html"
+
 clean:
-	rm -rf $(VENV) $(OUT) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(OUT) build docs/_build docs/api docs/records *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
