@@ -22,7 +22,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
-SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR = "#2a9d3a", "#f2c40f", "#d62718", "#8a8a8a"
+SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR = "#9fd8fb", "#e08a00", "#7a1200", "#8a8a8a"
 DOUBT, FAILURE = 0.25, 0.5
 """Probabilities from which a trajectory is drawn as doubtful and as failing, as in the paper."""
 TERRAIN = "gist_earth"
