@@ -167,7 +167,7 @@ class Preset:
     evaluation: EvaluationConfig = EvaluationConfig()
 
     def __post_init__(self):
-        require(self.model in ESTIMATORS, "model", self.model, f"one of {', '.join(ESTIMATORS)}")
+        require(self.model in list(ESTIMATORS), "model", self.model, f"one of {', '.join(ESTIMATORS)}")
         if epochs := self.training.head_epochs:
             kind = ESTIMATORS[self.model].load()
             require(1 in kind.phases, "[training] head_epochs", epochs, f"0: {kind.title} has no frozen trunk")
