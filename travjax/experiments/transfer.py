@@ -85,7 +85,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Trains what is not trained yet, and writes the results."""
-    suffix = "_field" if arguments.model == FIELD and Path(arguments.preset).suffix != ".toml" else ""
+    named = Path(arguments.preset).suffix != ".toml"
+    suffix = f"_{arguments.model}" if named and arguments.model not in (None, RESNET) else ""
     path = find_preset(arguments.preset + suffix, "transfer")
     out = arguments.out or Path("runs/transfer") / path.stem
     with held(out), going_on(launch.GOES_ON):
@@ -222,7 +223,7 @@ MEANING = (
 
 def _samples(transfer: Transfer) -> str:
     """Says what an epoch is trained on."""
-    if transfer.base.preset.model == FIELD:
+    if transfer.base.kind.reads_whole_maps:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
     return f"{TrajectorySamples(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 

@@ -6,7 +6,6 @@ import jax
 from safetensors import SafetensorError, safe_open
 
 from travjax.config import InputError, read_text
-from travjax.estimators.names import FIELD
 from travjax.files import first_lines, require_replaceable, save_text, user_path
 from travjax.runs.model_file import SUFFIX, write_model
 from travjax.runs.run import Run, load_estimator
@@ -64,7 +63,7 @@ def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | N
     real:   the table of real ground of the comparison, if it was run
     """
     preset, grid = trained.preset, trained.grid
-    seen, field = preset.corruption, preset.model == FIELD
+    seen, field = preset.corruption, trained.kind.reads_whole_maps
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
     measured = tables or "not evaluated: `travjax evaluate` writes the tables"
     corrupted = (
