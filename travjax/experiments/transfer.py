@@ -86,7 +86,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Trains what is not trained yet, and writes the results."""
     named = Path(arguments.preset).suffix != ".toml"
-    suffix = f"_{arguments.model}" if named and arguments.model not in (None, RESNET) else ""
+    suffix = f"_{arguments.model}" if named and arguments.model != RESNET else ""
     path = find_preset(arguments.preset + suffix, "transfer")
     out = arguments.out or Path("runs/transfer") / path.stem
     with held(out), going_on(launch.GOES_ON):
