@@ -1,4 +1,4 @@
-"""Building a data set in a folder: of synthetic maps, or of the windows of real sites."""
+"""Builds a data set in a folder: from synthetic maps, or from the windows of real sites."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +20,8 @@ def build_synthetic(
 ) -> Dataset:
     """Makes and labels synthetic maps, and saves the data set in a folder, with progress bars.
 
-    A data set that lies there is replaced. Raises InputError when robot, actions and grid do not fit together, when the
-    maps do not fit in memory, and when something else lies there or the data set cannot be written.
+    An existing data set is replaced. Raises InputError when robot, actions and grid do not fit together, when the maps
+    do not fit in memory, and when the folder holds something else or the data set cannot be written.
     """
     if note := world_note(config.world, grid):
         progress.say(note)
@@ -41,22 +41,22 @@ def build_from_sites(
 
 
 def _saved(make: Callable[[Progress], Dataset], total: int | None, folder: Path, what: str) -> Dataset:
-    """Saves what `make` makes and returns it; total: number of maps, if that is known before."""
+    """Saves the data set that `make` makes, and returns it; total: number of maps, if it is known in advance."""
     _require_free(folder)
     try:
-        with progress.bar("making", total, "map", delay=0.1) as bar:  # none where a file is refused at once
+        with progress.bar("making", total, "map", delay=0.1) as bar:  # no bar where a file is refused at once
             dataset = make(bar.update)
     except MemoryError as error:
         raise InputError(f"{what}: do not fit in memory: {error}") from None
     size = sum(array.nbytes for array in dataset.arrays.values())
     with progress.bar("saving", size, "B", unit_scale=True) as bar:
-        # The files' headers are not in the total.
+        # The total does not include the files' headers.
         save(dataset, folder, lambda added: bar.update(min(added, size - bar.n)))
     return dataset
 
 
 def _require_free(folder: Path) -> None:
-    """Refuses, before minutes of work, what `save` would refuse after them, and to replace the working folder."""
+    """Raises InputError early for a folder that `save` would refuse after minutes of work, and for the current one."""
     require(resolved(folder) != Path.cwd(), "--out", str(folder), "another folder than the one you are in")
     put_back(folder)
     try:

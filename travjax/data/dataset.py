@@ -1,6 +1,6 @@
 """The data set: maps, the labels of all their trajectories, and which split each map belongs to (SPEC section 7).
 
-`generate` makes it from one seed, all in memory, and sites.py makes one of real maps; `save` and `load` keep it as one
+`generate` makes it from one seed, all in memory, and sites.py makes one from real maps. `save` and `load` store it as a
 folder of .npy files with a `dataset.json` that holds the configurations and each file's size and SHA-256.
 """
 
@@ -42,22 +42,22 @@ from travjax.simulation.traverse import failures, packed, simulate
 from travjax.terrain.styles import STYLES, generate_terrain, require_world
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
-"""Each is a file of its own, `heights.npy` and so on; real maps have PROVENANCE_ARRAYS as well."""
+"""Each array has its own file, `heights.npy` and so on; data sets of real maps also have PROVENANCE_ARRAYS."""
 
 MAPS_AT_ONCE = 256
-"""Maps made and labelled before they are copied into the arrays."""
+"""Number of maps that are made and labelled before they are copied into the arrays."""
 
 Progress = Callable[[int], object]
 
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """What a synthetic data set is made from.
+    """The configuration of a synthetic data set.
 
-    maps:             number of maps, the five styles in turn
-    seed:             gives the terrain seeds and the splits
-    validation, test: shares of the maps, the rest is for training
-    world:            metres, the map size that features are derived from; the maps' own unless given
+    maps:             number of maps; the five styles alternate
+    seed:             determines the terrain seeds and the splits
+    validation, test: shares of the maps; the rest is for training
+    world:            metres, the map size that terrain features scale with; the size of the maps unless given
     """
 
     maps: int = 56_840
@@ -77,24 +77,24 @@ class DatasetConfig:
         require(self.validation + self.test <= 1, "validation + test", self.validation + self.test, "at most 1")
 
     def styles(self) -> np.ndarray:
-        """The style of each map: [n] texts."""
+        """Returns the style of each map: [n] texts."""
         return np.resize(np.array(STYLES), self.maps)
 
     def seeds(self) -> np.ndarray:
-        """The terrain seed of each map: [n] uint32, all different.
+        """Draws the terrain seed of each map: [n] uint32, all different.
 
-        Data sets of another seed or size have practically no map in common.
+        Data sets with different seeds or sizes have practically no map in common.
         """
-        spare = 64 + self.maps // 16  # for the few that come twice
+        spare = 64 + self.maps // 16  # replaces the few seeds that are drawn twice
         keys = random_keys(("terrain", (self.seed, self.maps)), np.arange(self.maps + spare)) >> np.uint64(32)
         first = np.sort(np.unique(keys, return_index=True)[1])
         return keys[first[: self.maps]].astype(np.uint32)
 
     def split_sizes(self) -> tuple[int, int, int]:
-        """Maps of each of SPLITS: the shares rounded down, the rest for training.
+        """Returns the number of maps in each of SPLITS: the shares rounded down, the rest for training.
 
-        The paper's 56,840 maps give 51157, 4547 and 1136, its own number of test maps. From three maps on
-        each split whose share is not 0 has one at least.
+        The paper's 56,840 maps give 51157, 4547 and 1136, which is its number of test maps. With three maps or more
+        each split whose share is not 0 has at least one.
         """
         test, validation = (math.floor(share * self.maps + 1e-9) for share in (self.test, self.validation))
         sizes = [self.maps - validation - test, validation, test]
@@ -106,9 +106,9 @@ class DatasetConfig:
         return tuple(sizes)  # type: ignore[return-value]
 
     def splits(self) -> np.ndarray:
-        """The split of each map: [n] uint8 index into SPLITS. Styles differ by one map at most in each split.
+        """Assigns each map to a split: [n] uint8 index into SPLITS; in a split, styles differ by at most one map.
 
-        The maps of each style are shuffled among the places of that style, and each split takes a run of places.
+        The maps of each style are shuffled among the places of that style, and each split takes consecutive places.
         """
         keys = random_keys(("split", (self.seed, self.maps)), np.arange(self.maps))
         order = np.arange(self.maps)
@@ -122,18 +122,18 @@ class DatasetConfig:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Maps, labels and splits; arrays on the host, to be read only.
+    """Maps, labels and splits; the arrays are on the host and must not be changed.
 
     heights: [n, rows, cols] float32 metres, NaN unknown
-    labels:  [n, t] uint8, one byte a trajectory as traverse.py packs them
-    group:   [n] style or site name; a style if there is a `config`
+    labels:  [n, t] uint8, one byte per trajectory as traverse.py packs them
+    group:   [n] name of the style (if there is a `config`) or of the site
     seed:    [n] uint32 terrain seed; 0 for real maps
     split:   [n] uint8 index into SPLITS
-    robot, actions, grid: what the labels hold for
-    config:  what the maps were made from; None for real maps
-    provenance: where real maps come from; None if that is not known
+    robot, actions, grid: the setup that the labels are valid for
+    config:  configuration of synthetic maps; None for real maps
+    provenance: where real maps come from; None if unknown
 
-    Raises InputError when the arrays do not fit together.
+    Raises InputError when the arrays do not match each other.
     """
 
     heights: np.ndarray
@@ -176,12 +176,12 @@ class Dataset:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays by name, those of the provenance last."""
+        """All arrays by name; those of the provenance come last."""
         return {name: getattr(self, name) for name in ARRAYS} | (self.provenance.arrays if self.provenance else {})
 
     @cached_property
     def fingerprint(self) -> str:
-        """Tells data sets apart: a hash of labels, seeds, groups and splits, and of heights and places of real maps."""
+        """A hash that identifies the data set: labels, seeds, groups, splits, and heights and origins of real maps."""
         digest = hashlib.sha256("\n".join(self.group).encode(errors="surrogatepass"))
         places = [] if self.config else [self.heights, *(self.provenance.arrays.values() if self.provenance else ())]
         for array in (self.labels, self.seed, self.split, *places):
@@ -189,7 +189,7 @@ class Dataset:
         return digest.hexdigest()[:16]
 
     def maps_of(self, split: str) -> np.ndarray:
-        """Indices of the maps of "train", "validation" or "test": [k]."""
+        """Returns the indices of the maps of "train", "validation" or "test": [k]."""
         require(split in SPLITS, "split", split, f"one of {', '.join(SPLITS)}")
         return np.flatnonzero(self.split == SPLITS.index(split))
 
@@ -199,8 +199,8 @@ def generate(
 ) -> Dataset:
     """Makes and labels the maps; the same arguments give the same data set.
 
-    on_progress is called with the number of maps that were added. Memory: the arrays, 4.0 GB for the paper's 56,840
-    maps, and a few hundred MB of work. Raises InputError when robot, actions and grid do not fit together.
+    on_progress is called with the number of maps that were added. Needs memory for the arrays, 4.0 GB for the paper's
+    56,840 maps, and a few hundred MB more. Raises InputError when robot, actions and grid do not fit together.
     """
     node_table(robot, actions, grid)
     styles, seeds = config.styles(), config.seeds()
@@ -218,7 +218,7 @@ def generate(
 
 
 def require_matching(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    """Raises InputError, which names both, unless the data set is labelled for this robot, action space and grid."""
+    """Raises InputError, with both values, unless the data set is labelled for this robot, action space and grid."""
     for name, given in (("robot", robot), ("actions", actions), ("grid", grid)):
         ours = getattr(dataset, name)
         if ours != given:
@@ -230,14 +230,14 @@ def require_matching(dataset: Dataset, robot: Robot, actions: ActionSpace, grid:
 
 
 def configs_to_json(dataset: Dataset) -> dict[str, Any]:
-    """All of a data set but its arrays as JSON can hold it, with the version of travjax."""
+    """Converts all of a data set except its arrays to what JSON can hold, with the version of travjax."""
     parts = {name: getattr(dataset, name) for name in ("robot", "actions", "grid", "config")}
     table = {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
     return table | ({"provenance": dataset.provenance.to_json()} if dataset.provenance else {})
 
 
 def dataset_from_arrays(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
-    """The data set of what `configs_to_json` gave and its arrays; raises InputError when they are something else."""
+    """Restores a data set from its arrays and the output of `configs_to_json`; raises InputError for anything else."""
     synthetic = table.get("config") is not None
     kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid} | ({"config": DatasetConfig} if synthetic else {})
     configs = {"config": None} | parts_from_json(table, kinds)
@@ -248,10 +248,10 @@ def dataset_from_arrays(table: dict[str, Any], arrays: dict[str, np.ndarray]) ->
 
 
 def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = None) -> None:
-    """Writes the data set to a folder, whole or not at all; a data set that lies there is replaced.
+    """Writes the data set to a folder, completely or not at all; an existing data set there is replaced.
 
-    on_progress is called with the number of bytes that were added. Raises InputError when something else lies there
-    or when it cannot be written: a full disk, no permission.
+    on_progress is called with the number of bytes that were added. Raises InputError when the folder holds something
+    else or cannot be written (disk full, no permission).
     """
     with atomic_write_folder(user_path(folder), is_dataset) as temporary:
         arrays = {f"{name}.npy": array for name, array in dataset.arrays.items()}
@@ -263,8 +263,8 @@ def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = No
 def load(folder: str | Path) -> Dataset:
     """Reads a data set that `save` wrote.
 
-    Raises InputError, which names folder, file and what is wrong, when something is missing, truncated or altered,
-    of another format version, or does not fit together.
+    Raises InputError, which names folder, file and fault, when something is missing, truncated, altered, inconsistent
+    or of another format version.
     """
     folder = user_path(folder)
     put_back(folder)
@@ -289,9 +289,9 @@ load_dataset = load
 def _read_array(path: Path) -> np.ndarray:
     try:
         with path.open("rb") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of headers that are not NumPy's own
+            warnings.simplefilter("ignore")  # NumPy warns of headers that it did not write
             array = np.load(file, allow_pickle=False)
-    except Exception as error:  # NumPy raises all sorts over what is no array
+    except Exception as error:  # NumPy raises many kinds of error for files that hold no array
         reason = str(error).partition(". ")[0] or type(error).__name__
         raise InputError(f"{path}: cannot be read as an array: {reason}") from None
     require(isinstance(array, np.ndarray), str(path), type(array).__name__, "a .npy file of one array")
@@ -311,7 +311,7 @@ def _verify(path: Path, size: int, expected: str) -> None:
 
 
 class _Hashing:
-    """A file to write to that hashes and counts what goes through it."""
+    """A writable file that hashes and counts the bytes written to it."""
 
     def __init__(self, file, on_progress: Progress | None):
         self.file, self.on_progress = file, on_progress
@@ -326,7 +326,7 @@ class _Hashing:
 
 
 def _write(path: Path, array: np.ndarray, on_progress: Progress | None) -> dict[str, Any]:
-    """Writes a .npy file piece by piece; returns its size and checksum."""
+    """Writes a .npy file piece by piece, and returns its size and checksum."""
     with path.open("wb") as file:
         hashing = _Hashing(file, on_progress)
         np.lib.format.write_array(hashing, array, allow_pickle=False)
@@ -334,7 +334,7 @@ def _write(path: Path, array: np.ndarray, on_progress: Progress | None) -> dict[
 
 
 def is_dataset(folder: Path) -> bool:
-    """Whether the folder holds a data set of any version and nothing else."""
+    """Tells whether the folder holds a data set of any version and nothing else."""
     try:
         table = read_json(folder / "dataset.json")
         ours = {"dataset.json", *(f"{name}.npy" for name in ARRAYS + PROVENANCE_ARRAYS)}

@@ -1,4 +1,4 @@
-"""dataset.json, which says what the arrays in a data set's folder are, and the size and SHA-256 of their files."""
+"""Reads dataset.json, which describes the arrays in a data set's folder, with the size and SHA-256 of their files."""
 
 import hashlib
 import json
@@ -12,9 +12,9 @@ FORMAT, FORMAT_VERSION = "travjax data set", 1
 
 
 def read_table(path: Path) -> dict[str, Any]:
-    """Reads dataset.json, without its checksum.
+    """Reads dataset.json, and returns it without its checksum.
 
-    Raises InputError that names it when it is missing, something else, of another version, or altered.
+    Raises InputError, which names the file, when it is missing, something else, of another version, or altered.
     """
     table = read_json(path)
     if not isinstance(table, dict) or table.get("format") != FORMAT:
@@ -29,9 +29,9 @@ def read_table(path: Path) -> dict[str, Any]:
 
 
 def files_of(table: dict[str, Any], names: Sequence[str], path: Path) -> dict[str, tuple[int, str]]:
-    """Returns size and checksum of the file of each array of these names, as dataset.json has them.
+    """Returns the size and checksum that dataset.json gives for the file of each of these arrays.
 
-    Raises InputError that names the file and the entry when one is missing, of no use, or of something else.
+    Raises InputError, which names file and entry, when an entry is missing, unusable, or not of one of these arrays.
     """
     told, expected = table.get("files"), [f"{name}.npy" for name in names]
     files = told if isinstance(told, dict) else {}
@@ -43,5 +43,5 @@ def files_of(table: dict[str, Any], names: Sequence[str], path: Path) -> dict[st
 
 
 def digest(table: dict[str, Any]) -> str:
-    """Returns the checksum of all that dataset.json holds beside it."""
+    """Returns the checksum of all other entries of dataset.json."""
     return hashlib.sha256(json.dumps(table, sort_keys=True, allow_nan=False).encode()).hexdigest()

@@ -1,8 +1,8 @@
 """Real elevation maps: read a file, fill small holes, resample, cut into windows (SPEC section 11).
 
-Files are brought to one convention: row 0 is the southernmost, column 0 the westernmost, a value stands at its pixel's
-centre. Rasters that GDAL reads say themselves how they run; .npy and .npz are as grid.py; of points, x is east and y is
-north. What a file is, its content says.
+Files are converted to one convention: row 0 is the southernmost, column 0 the westernmost, and a value belongs to the
+centre of its pixel. Rasters that GDAL reads declare their orientation; .npy and .npz follow grid.py; for points, x is
+east and y is north. The type of a file is recognised by its content.
 """
 
 from collections.abc import Iterator
@@ -26,10 +26,10 @@ from travjax.rasters.surface import Surface
 from travjax.simulation.grid import Grid, require_grid
 
 MOST_WINDOWS = 2**20
-"""Windows of a file, at most."""
+"""The largest number of windows of one file."""
 
 FAR_APART = 100.0
-"""Metres: maps of one file whose heights differ by more are each counted from a height of their own."""
+"""Metres: if the maps of a file differ by more in height, each gets a height offset of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +38,12 @@ class Windows:
 
     origins:       [n, 2] float64 x, y of each window's south-west node
     cell_size:     metres between values in the file; the windows are at the grid's spacing
-    crs:           coordinate system as the file names it, or None; of a file that names several, one for each window
-    height_offset: metres, subtracted from the file's heights in float64; of a file whose maps are each counted from a
-                   height of their own, [n, 1, 1]
+    crs:           coordinate system as the file names it, or None; one for each window if the file names several
+    height_offset: metres, subtracted from the file's heights in float64; [n, 1, 1] where each map has its own
+                   offset
     covered:       share of the file's area that lies in some window
-    filled:        share of all cells that was interpolated in small holes
-    unknown:       share of all cells that stays unknown
+    filled:        share of all cells that were interpolated in small holes
+    unknown:       share of all cells that remain unknown
     path, sha256:  the file and its checksum
     notes:         lines about how the file was read that its user should know
     """
@@ -70,14 +70,14 @@ class Windows:
     def heights(self) -> np.ndarray:
         """All windows at once, [n, rows, cols] float32 metres above `height_offset`, NaN unknown.
 
-        Raises InputError when they do not fit into memory; `read` takes some of them.
+        Raises InputError when they do not fit into memory; `read` reads only some of them.
         """
         size = 4 * len(self) * self._grid.nodes**2
         require_memory(size, f"{self.path}: {len(self)} windows", "; take a larger stride, or some at a time")
         return self.read(slice(None))
 
     def read(self, which: slice | np.ndarray) -> np.ndarray:
-        """Returns some of the windows, [k, rows, cols] as in `heights`; quickest in their order."""
+        """Reads some of the windows, [k, rows, cols] as in `heights`; fastest in their own order."""
         corners = self._corners[which]
         cut = np.empty((len(corners), *self._grid.shape), np.float32)
         with _naming(Path(self.path)):
@@ -116,21 +116,22 @@ def load_dem(
 
     path:         GeoTIFF or another raster of local pixels that GDAL reads; .npy, or .npz with `heights` ([rows, cols],
                   or several maps [n, rows, cols] that are cut one by one) and `cell_size`; a point cloud or a mesh as
-                  clouds.py reads it; any of them packed by gzip
+                  clouds.py reads it; any of them may be compressed with gzip
     stride:       metres between the origins of neighbouring windows, rounded to whole cells
-    cell_size:    metres, for files that do not say; of a point cloud the cells in which points are averaged, unless
-                  they stand on a lattice: the grid's spacing, or what holds two points on average if that is more
-    height_scale: metres per unit of the file's values; 1, or what the file says, unless given; a picture needs it
+    cell_size:    metres, for files that do not state it; for a point cloud that is not a regular lattice, the cells in
+                  which points are averaged: unless given, the grid's spacing, or cells that hold two points on
+                  average if those are larger
+    height_scale: metres per unit of the file's values; 1, or what the file states, unless given; required for pictures
     nodata:       a value that marks unknown ground, if the file does not declare it
-    fill_holes:   interpolate holes whose every cell lies within 0.125 m, or one cell, of known ground
-    allow_coarse: take cells larger than 0.125 m
-    band:         number from 1, or description, of a band; name of a variable of a netCDF file, "name:2" for its second
-    classes:      of LAS points that are ground; ground alone where the file has it beside others, unless given
-    up:           "y" where that axis of a point cloud or mesh points up; "z" unless given
-    gdal_drivers: drivers of GDAL that may read the file beside those in raster_files.DRIVERS
-    Raises InputError when the file is missing, is no elevation map, is in degrees, feet or another system whose metre
-    is none on the ground, has no, a non-square or too large a cell size or not the given one, infinite or absurd
-    heights or none at all, is smaller than one window, or does not fit into memory.
+    fill_holes:   interpolate holes in which every cell lies within 0.125 m, or one cell, of known ground
+    allow_coarse: accept cells larger than 0.125 m
+    band:         number from 1, or description, of a band; name of a netCDF variable, "name:2" for its second band
+    classes:      classes of LAS points to use; unless given, ground only, if the file has classified ground
+    up:           "y" if that axis of a point cloud or mesh points up; "z" unless given
+    gdal_drivers: GDAL drivers that may read the file besides those in gdal_files.DRIVERS
+    Raises InputError when the file is missing, is not an elevation map, is in degrees, feet or a system whose units are
+    not metres on the ground, has no cell size, a non-square or too large one, or one that differs from the given, has
+    infinite or absurd heights or no known ones, is smaller than one window, or does not fit into memory.
     """
     path = user_path(path)
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
@@ -179,7 +180,7 @@ def load_dem(
 
 @contextmanager
 def _naming(path: Path) -> Iterator[None]:
-    """Puts the file's name before what is wrong with it."""
+    """Prefixes errors about a file with its name."""
     try:
         yield
     except InputError as error:
@@ -191,7 +192,7 @@ def _naming(path: Path) -> Iterator[None]:
 
 
 def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """Reads the rasters of a file, by what it holds."""
+    """Reads the rasters of a file according to its content."""
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
@@ -205,7 +206,7 @@ def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
             rasters = [read_raster(readable, options)]
         else:
             rasters = [read_cloud(readable, form, options, grid)]
-        if readable != path:  # a copy, which goes
+        if readable != path:  # a temporary copy, which will be deleted
             rasters = [replace(raster, heights=_all(raster)) for raster in rasters]
     return rasters
 
@@ -217,7 +218,7 @@ def _all(raster: Raster) -> np.ndarray:
 
 
 def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """Reads the maps of an .npz, or its points."""
+    """Reads the maps or the points in an .npz."""
     entries, names = read_npz(path)
     if "heights" in entries:
         return rasters_of(entries, options, names)
@@ -227,9 +228,7 @@ def _read_archive(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
 
 
 def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarray, float]:
-    """Returns the raster of each window with row and column of its south-west node, [n, 3], and the share they
-    cover.
-    """
+    """Returns (raster, row, column) of the south-west node of each window, [n, 3], and the share that they cover."""
     step, found, covered = round(stride / grid.spacing), [], []
     for index, raster in enumerate(rasters):
         nodes = [int((edge - 1) * raster.cell_size / grid.spacing + 1e-6) + 1 for edge in raster.heights.shape]
@@ -244,9 +243,7 @@ def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarr
 
 
 def _offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
-    """Returns the whole metres above which the heights of each raster are counted: the same unless they lie
-    FAR_APART.
-    """
+    """Returns the height offset of each raster in whole metres: the same for all unless they are FAR_APART."""
     if rasters[0].height_offset is not None:
         return [raster.height_offset or 0.0 for raster in rasters]
     medians = np.array([found.median for found in surveys])

@@ -1,9 +1,9 @@
-"""Batches of maps with where they come from, their labels, and which of them to show.
+"""Batches of maps with their origin and labels, and the choice of maps to show.
 
 A `MapStream` makes them from styles and seeds, or reads them from elevation maps.
 
-A batch is a dict of arrays with a common leading axis: `heights` [n, rows, cols] and `group` [n] (style or file), what
-else tells its maps apart, and, once labelled, the margins, `known` and `failed`.
+A batch is a dict of arrays with a common leading axis: `heights` [n, rows, cols], `group` [n] (style or file), further
+arrays that identify its maps, and, once labelled, the margins, `known` and `failed`.
 """
 
 import dataclasses
@@ -28,12 +28,12 @@ from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_pa
 Batch = dict[str, np.ndarray]
 
 Say = Callable[[str], object]
-"""Is given lines that say what maps there are."""
+"""A function that is called with lines about the maps."""
 
 
 @dataclass(frozen=True)
 class WindowOptions:
-    """How elevation maps are read and cut into windows, as `load_dem` takes it.
+    """The settings of `load_dem` for reading elevation maps and cutting them into windows.
 
     stride: metres between the windows
     """
@@ -45,7 +45,7 @@ class WindowOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Returns them by the names of `load_dem`."""
+        """All settings by the argument names of `load_dem`."""
         own = {name: getattr(self, name) for name in ("stride", "fill_holes", "allow_coarse")}
         return dataclasses.asdict(self.reading) | own
 
@@ -56,9 +56,9 @@ class MapStream:
 
     total:   number of maps
     batches: the maps, once
-    files:   how each elevation map was read; none of synthetic maps
-    world:   metres, the map size that features of synthetic maps are derived from, if it was given
-    paper:   whether they are of the paper's styles, so that failure shares compare with its own
+    files:   how each elevation map was read; empty for synthetic maps
+    world:   metres, the map size that features of synthetic maps scale with, if it was given
+    paper:   whether the maps have the paper's styles, so that failure shares can be compared with the paper's
     """
 
     total: int
@@ -75,7 +75,7 @@ class MapStream:
         world: float | None = None,
         say: Say = lambda line: None,
     ) -> "MapStream":
-        """Makes maps of these seeds [n], the styles in turn.
+        """Makes maps with these seeds [n] and alternating styles.
 
         Raises InputError as `generate_terrain` does.
         """
@@ -91,7 +91,7 @@ class MapStream:
     def from_files(
         paths: Sequence[Path], grid: Grid, options: WindowOptions = WindowOptions(), say: Say = lambda line: None
     ) -> "MapStream":
-        """Reads the windows of elevation maps; `say` is told of each file what its windows cover.
+        """Reads the windows of elevation maps; `say` is called with lines about each file and its windows.
 
         Raises InputError as `load_dem` does.
         """
@@ -111,7 +111,7 @@ class MapStream:
 
 
 def _described(path: Path, windows: Windows) -> list[str]:
-    """Returns lines on a file and the windows that were cut out of it."""
+    """Describes a file and the windows that were cut out of it, in lines."""
     systems = dict.fromkeys(windows.systems().tolist())
     said = (
         f"{path}: {len(windows)} windows cover {windows.covered:.1%}, cells of {windows.cell_size:g} m, "
@@ -122,12 +122,12 @@ def _described(path: Path, windows: Windows) -> list[str]:
 
 
 def _shown(crs: str) -> str:
-    """Returns the code of a coordinate system, or the name of one without a code."""
+    """Returns the code of a coordinate system, or its name if it has no code."""
     return crs.split('"')[1] if '"' in crs else crs or "none"
 
 
 def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: float | None = None) -> Iterator[Batch]:
-    """Maps of the styles and seeds [n] in a world, with the parameters and noise seeds that make them again.
+    """Makes maps of the styles and seeds [n] in a world, with the parameters and noise seeds that reproduce them.
 
     Raises InputError as `generate_terrain` does.
     """
@@ -139,7 +139,7 @@ def synthetic_batches(styles: list[str], seeds: list[int], grid: Grid, world: fl
 
 
 def _noise_maps(styles: list[str], seeds: list[int], grid: Grid, world: float | None) -> Batch:
-    """Makes maps of the paper's styles: their heights, noise seeds and parameters."""
+    """Makes maps of the paper's styles; returns heights, noise seeds and parameters."""
     params, noise_seeds = sample_params(styles, seeds)
     return {
         "heights": np.asarray(elevation(params, noise_seeds, grid=grid, world=world)),
@@ -149,14 +149,14 @@ def _noise_maps(styles: list[str], seeds: list[int], grid: Grid, world: float | 
 
 
 def _rock_fields(seeds: list[int], grid: Grid) -> Batch:
-    """Makes rock fields: their heights and parameters."""
+    """Makes rock fields; returns heights and parameters."""
     params = [to_json(sample_rock_field(seed)) for seed in seeds]
     fields = {field: np.array([one[field] for one in params]) for field in params[0]}
     return {"heights": rock_fields(seeds, grid), **fields}
 
 
 def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
-    """The windows of named sites, with where on the site each lies."""
+    """Reads the windows of named sites, with the position of each on its site."""
     for name, windows in sites:
         for start in range(0, len(windows), BATCH):
             some = slice(start, start + BATCH)
@@ -171,7 +171,7 @@ def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
 
 
 def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Batch:
-    """The batch with `known` and a margin by the name of each of the robot's k events [n, t], and `failed` [n, t, k].
+    """Adds to a batch `known` and the margin of each of the robot's k events by name, [n, t], and `failed` [n, t, k].
 
     Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
     """
@@ -185,23 +185,23 @@ def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Ba
 
 
 def bytes_each(robot: Robot, actions: ActionSpace, grid: Grid) -> int:
-    """Returns how much a labelled map takes: heights, and of a trajectory a margin and a flag an event and `known`."""
+    """Returns the bytes of a labelled map: heights, and per trajectory `known` and each event's margin and flag."""
     return 4 * grid.nodes**2 + len(actions) * (5 * len(robot.events) + 1)
 
 
 def joined(batches: list[Batch]) -> Batch:
-    """All batches as one."""
+    """Joins batches into one."""
     return {key: np.concatenate([batch[key] for batch in batches]) for key in batches[0]}
 
 
 def samples(maps: Batch, most: int = 5) -> np.ndarray:
-    """Indices of labelled maps to show: the groups in turn and spread over each.
+    """Returns the indices of labelled maps to show: taken from the groups in turn, and spread over each group.
 
-    Those come first that fail neither nowhere nor everywhere.
+    Maps where 5% to 60% of the trajectories fail come first.
     """
     fails = (maps["failed"].any(axis=-1) & maps["known"]).mean(axis=-1)
     dull = (fails < 0.05) | (fails > 0.6)
-    spread = np.arange(len(fails)) * 0.618034 % 1  # the smallest few of these lie far apart
+    spread = np.arange(len(fails)) * 0.618034 % 1  # the smallest few of these belong to maps that are far apart
     groups: dict[str, list[int]] = {}
     for index in np.lexsort((spread, dull)):
         groups.setdefault(maps["group"][index], []).append(int(index))
@@ -210,7 +210,7 @@ def samples(maps: Batch, most: int = 5) -> np.ndarray:
 
 
 def title(maps: Batch, index: int) -> str:
-    """One line that tells a map from the others: its group, and its seed or south-west corner."""
+    """Returns a line that identifies a map: its group, and its seed or south-west corner."""
     seed = "seed" in maps
     where = f"seed {maps['seed'][index]}" if seed else "SW ({:.1f}, {:.1f})".format(*maps["origin"][index])
     return f"{one_line(maps['group'][index], 30)}, {where}"

@@ -1,4 +1,4 @@
-"""Where real maps come from: the sites as they are asked for, and of each window its place and how it was turned."""
+"""Where real maps come from: the configured sites, and the position and rotation of each window."""
 
 import math
 from dataclasses import dataclass, field, fields
@@ -15,21 +15,21 @@ SPLITS = ("train", "validation", "test")
 SIDES = ("north", "east", "south", "west")
 
 LEAST_GAP = 8.0
-"""Metres: what is nearer to held-out ground than one of the paper's maps is too much like it."""
+"""Metres: ground nearer to held-out ground than the size of the paper's maps resembles it too much."""
 
 Strip = tuple[str, float] | tuple[()]
-"""A side and metres; or none."""
+"""A side and metres, or empty for no strip."""
 
 
 @dataclass(frozen=True)
 class Site:
-    """One elevation map and what its windows are for.
+    """One elevation map and the splits that its windows belong to.
 
-    file:  here, or under TRAVJAX_DATA
-    name:  the group of its windows, the file's stem unless given
-    split: of its windows that lie in no strip
-    test_strip, validation_strip: side of the site and metres; for the windows that lie wholly in that strip along
-        the outermost windows of the side
+    file:  path from the current folder, or under TRAVJAX_DATA
+    name:  group of its windows; the file's stem unless given
+    split: split of its windows that lie in no strip
+    test_strip, validation_strip: side of the site and metres; windows that lie wholly in this strip along that side
+        belong to the split. The strip starts at the edge of the outermost windows
     cell_size, height_scale, nodata, band, classes, up, gdal_drivers: as `load_dem` takes them
 
     Raises InputError that names field, value and what is allowed.
@@ -57,16 +57,16 @@ class Site:
             needless = SPLITS.index(self.split) >= SPLITS.index(split)
             require(not (strip and needless), f"{split}_strip", strip, f"left out where split is {self.split}")
         options = DemOptions(**{field.name: getattr(self, field.name) for field in fields(DemOptions)})
-        object.__setattr__(self, "nodata", options.nodata)  # NaN is none
+        object.__setattr__(self, "nodata", options.nodata)  # NaN means no value
 
     @property
     def group(self) -> str:
-        """What its windows are called."""
+        """The name of the group of its windows."""
         return self.name or Path(self.file).stem
 
     @property
     def strips(self) -> dict[str, Strip]:
-        """The strip of each split that may have one, the test first."""
+        """The strips for test and validation, in this order."""
         return {"test": self.test_strip, "validation": self.validation_strip}
 
 
@@ -80,12 +80,12 @@ def _require_strip(name: str, strip: Any) -> None:
 
 @dataclass(frozen=True)
 class SitesConfig:
-    """What a data set of real maps is made from; a TOML file has a table [[site]] for each.
+    """The configuration of a data set of real maps; a TOML file has a table [[site]] for each site.
 
     stride:       metres between neighbouring windows
-    gap:          metres between any test window and those for training and validation, at least
+    gap:          smallest distance in metres between a test window and one for training or validation
     max_unknown:  share of unknown nodes above which a window is left out
-    rotations:    training windows also turned by 90, 180 and 270 degrees
+    rotations:    whether training windows are also added rotated by 90, 180 and 270 degrees
     fill_holes, allow_coarse: as `load_dem` takes them
 
     Raises InputError that names field, value and what is allowed.
@@ -121,18 +121,18 @@ class SitesConfig:
 
 @dataclass(frozen=True)
 class SiteRecord:
-    """What was read of a site, and what became of its windows.
+    """How a site was read, and how many of its windows went to each split or were left out.
 
     name:       the group of its maps
-    file:        as asked for, here or under TRAVJAX_DATA
+    file:       as in `Site`
     sha256, cell_size, covered, filled, unknown: as in `dem.Windows`
-    crs:         coordinate system as the file names it, or several
-    height_offset: metres, subtracted from the file's heights; None where its maps have one each
-    windows:    all that were cut
-    train, validation, test: of these, for each split; turned copies do not count
-    too_unknown: of these, left out for too many unknown nodes or no known trajectory
-    near_test:  of these, left out for lying within the gap around a test window
-    shared:     of these, left out for sharing ground with a validation window
+    crs:        coordinate system as the file names it, or several
+    height_offset: metres, subtracted from the file's heights; None where each map has its own
+    windows:    number of windows that were cut
+    train, validation, test: how many of these are in each split; rotated copies do not count
+    too_unknown: how many were left out for too many unknown nodes or no known trajectory
+    near_test:  how many were left out because they lie within the gap around a test window
+    shared:     how many were left out because they share ground with a validation window
     """
 
     name: str
@@ -166,12 +166,12 @@ class SiteRecord:
 
 @dataclass(frozen=True, eq=False)
 class Provenance:
-    """Where each of n real maps comes from; arrays on the host, to be read only.
+    """Where each of n real maps comes from; the arrays are on the host and must not be changed.
 
     origin:        [n, 2] float64 x, y of the south-west node of its window, in the site's coordinates, metres
-    quarter_turns: [n] uint8, 0 to 3: how many times the map is the window turned by 90 degrees about its centre,
-                   anticlockwise as seen from above
-    config:        what was asked for
+    quarter_turns: [n] uint8, 0 to 3: by how many quarter turns the window was rotated to make the map, about its centre
+                   and anticlockwise as seen from above
+    config:        the configuration that it was read with
     sites:         a record for each site of `config`, in its order
     """
 
@@ -188,16 +188,16 @@ class Provenance:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """By name; each is a file of its own in a data set."""
+        """The arrays by name; each has its own file in a data set."""
         return {name: getattr(self, name) for name in PROVENANCE_ARRAYS}
 
     def to_json(self) -> dict[str, Any]:
-        """Converts all but the arrays to what JSON can hold."""
+        """Converts everything except the arrays to what JSON can hold."""
         return {"config": to_json(self.config), "sites": [to_json(site) for site in self.sites]}
 
     @staticmethod
     def from_json(table: Any, origin: np.ndarray, quarter_turns: np.ndarray) -> "Provenance":
-        """Restores it from what `to_json` gave and the arrays; raises InputError over anything else."""
+        """Restores it from the arrays and the output of `to_json`; raises InputError for anything else."""
         config = parts_from_json(table, {"config": SitesConfig})["config"]
         sites = table.get("sites")
         require(isinstance(sites, list), "sites", sites, "a list of tables")

@@ -1,11 +1,11 @@
 """Which (map, trajectory) pairs to train on: balanced subsets, natural samples and shuffled batches (SPEC section 7).
 
 Everything here is NumPy on the host and cheap: a balanced subset of the paper's 51,157 training maps takes a second, so
-that a fresh one can be drawn for each epoch. Samples are a pair of int32 arrays (map_index, trajectory_index). Labels
-are [n, t], one byte a trajectory as traverse.py packs them.
+a fresh one can be drawn for each epoch. Samples are a pair of int32 arrays (map_index, trajectory_index). Labels are
+[n, t], one byte per trajectory as traverse.py packs them.
 
-Random choices are the smallest of keys that depend on the seed, the map and the trajectory alone (`random_keys`), so a
-map's choice is the same whichever other maps are asked about, and on every version of NumPy.
+A random choice takes the smallest of random keys that depend only on the seed, the map and the trajectory
+(`random_keys`), so the choice for a map does not depend on the other maps or on the version of NumPy.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -18,19 +18,19 @@ from travjax.config import InputError, require
 from travjax.simulation.events import FAILED, UNKNOWN_LABEL
 
 MAPS_AT_ONCE = 256
-"""Maps whose labels are looked at together: 256 x 3042 keys of 8 bytes are 6 MB."""
+"""Number of maps whose labels are processed together: 256 x 3042 keys of 8 bytes are 6 MB."""
 
 Samples = tuple[np.ndarray, np.ndarray]
 Seed = int | Sequence[int]
 
 _PLACE_BITS = 20
-"""Lowest bits of a key that hold the trajectory, of which an action space has at most a million."""
+"""Lowest bits of a key that hold the trajectory index; an action space has at most a million trajectories."""
 
 
 def balanced_subset(labels: np.ndarray, maps: np.ndarray, seed: Seed, each: int = 11, failing: int = 6) -> Samples:
-    """Of each map `failing` random trajectories with any failure, or all if fewer, and safe ones up to `each`.
+    """Draws `each` random trajectories per map, `failing` of them with some failure (or all such, if fewer).
 
-    labels: [n, t] uint8; maps: [k] indices. Unknown trajectories are never taken; a map with too few safe ones gives
+    labels: [n, t] uint8; maps: [k] indices. Unknown trajectories are never drawn; a map with too few safe ones gives
     fewer than `each`. Source: SPEC section 7.
     """
     require(1 <= each, "each", each, "at least 1 trajectory a map")
@@ -47,9 +47,9 @@ def balanced_subset(labels: np.ndarray, maps: np.ndarray, seed: Seed, each: int 
 
 
 def natural_sample(labels: np.ndarray, maps: np.ndarray, seed: Seed, number_of_maps: int, each: int) -> Samples:
-    """Of `number_of_maps` random maps `each` random known trajectories, or all there are.
+    """Draws `number_of_maps` random maps, and `each` random known trajectories (or all, if fewer) on each of them.
 
-    Failures are then as frequent as on the maps, which come in the order of `maps`.
+    Failures are then as frequent as on the maps. The chosen maps keep the order of `maps`.
     labels: [n, t] uint8; maps: [k] indices
     """
     require(1 <= number_of_maps, "number_of_maps", number_of_maps, "at least 1")
@@ -61,22 +61,22 @@ def natural_sample(labels: np.ndarray, maps: np.ndarray, seed: Seed, number_of_m
 
 
 def every_sample(labels: np.ndarray, maps: np.ndarray) -> Samples:
-    """Every known trajectory of the maps: labels [n, t] uint8, maps [k] indices."""
+    """Returns every known trajectory of the maps: labels [n, t] uint8, maps [k] indices."""
     return _joined(_pairs(part, are_known(labels[part])) for part in _chunks(_map_indices(labels, maps)))
 
 
 def are_known(labels: np.ndarray) -> np.ndarray:
-    """Which of some labels are of known trajectories."""
+    """Tells which labels belong to known trajectories."""
     return (labels & UNKNOWN_LABEL) == 0
 
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """The balanced subset of each epoch.
+    """Draws the balanced subset of each epoch.
 
     labels: [n, t] uint8; maps: [k] indices; each, failing: as in `balanced_subset`
-    fresh:  False for the same subset in every epoch, as in the paper; True for a new one, which costs little since
-            every trajectory has a label
+    fresh:  False for the same subset in every epoch, as in the paper; True for a new one in each, which costs little
+            since every trajectory has a label
     """
 
     labels: np.ndarray
@@ -87,7 +87,7 @@ class Sampler:
     fresh: bool = False
 
     def epoch(self, number: int) -> Samples:
-        """The samples of an epoch."""
+        """Returns the samples of an epoch."""
         return self._subset((self.seed, number)) if self.fresh else self._fixed
 
     @cached_property
@@ -99,10 +99,10 @@ class Sampler:
 
 
 def batches(samples: Samples, size: int, seed: int, epoch: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The samples of an epoch in random order: (map_index, trajectory_index, weight), each [steps, size].
+    """Shuffles the samples of an epoch into batches: (map_index, trajectory_index, weight), each [steps, size].
 
-    The last batch is filled up from the start of the same order with weight 0, so that shapes stay the same and each
-    sample counts once. weight: float32, else 1.
+    The weight (float32) is 1. The last batch is filled up with samples from the start of the order with weight 0, so
+    that all batches have one shape and each sample counts once. Raises InputError when there are no samples.
     """
     require(1 <= size, "batch size", size, "at least 1")
     maps, trajectories = samples
@@ -116,11 +116,11 @@ def batches(samples: Samples, size: int, seed: int, epoch: int) -> tuple[np.ndar
 
 
 def random_keys(stream: tuple[str, Seed], *numbers: np.ndarray) -> np.ndarray:
-    """One random uint64 for each item of a purpose and seed, the same whichever items are asked about together.
+    """Returns a random uint64 for each item of a stream; it does not depend on the other items in the call.
 
     stream:  what the keys are for, and a seed
-    numbers: integer arrays that broadcast; together they name an item
-    Source: the output function of SplitMix64 (Steele, Lea, Flood 2014), once for each number that is added.
+    numbers: integer arrays that broadcast; together they identify an item
+    Source: the output function of SplitMix64 (Steele, Lea, Flood 2014), applied once for each number.
     """
     purpose, seed = stream
     entropy = list(seed) if isinstance(seed, Sequence) else [seed]
@@ -143,7 +143,7 @@ def _mixed(bits: np.ndarray) -> np.ndarray:
 
 
 def _chosen(labels, maps, stream, choose: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Samples:
-    """The trajectories that `choose(labels, keys)` [c, k] names for each map, -1 for none."""
+    """Collects, as samples, the trajectories that `choose(labels, keys)` picks for each map: [c, k], -1 for none."""
     maps = _map_indices(labels, maps)
     trajectories = np.arange(labels.shape[1])
 
@@ -156,7 +156,7 @@ def _chosen(labels, maps, stream, choose: Callable[[np.ndarray, np.ndarray], np.
 
 
 def _smallest(keys: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
-    """The columns of the `count` smallest allowed keys of each row, smallest first, -1 where there are no more."""
+    """Returns the columns of the `count` smallest allowed keys in each row, smallest first; -1 if there are fewer."""
     count = min(count, keys.shape[1])
     if not count:
         return np.empty((len(keys), 0), np.int64)

@@ -1,6 +1,6 @@
-"""What sensors do to elevation maps: noise, missing nodes, a coarser grid; and filling what is missing.
+"""Simulated sensor errors in elevation maps (noise, missing nodes, a coarser grid), and repairs of missing nodes.
 
-All NumPy on the host. Maps are [n, rows, cols] metres.
+Everything is NumPy on the host. Maps are [n, rows, cols] metres.
 """
 
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ Maps = Float[np.ndarray, "n rows cols"]
 
 @dataclass(frozen=True)
 class CorruptionConfig:
-    """What of the training maps is corrupted, each time anew; their labels stay those of the clean map.
+    """How training maps are corrupted, newly drawn each time; the labels remain those of the clean maps.
 
-    share:   of the maps; the others are seen as they are
-    noise:   metres, largest standard deviation of the noise; it is uniform from 0
-    missing: largest share of missing nodes, uniform from 0, in half of the corrupted maps
-    coarse:  share of the corrupted maps of which only every second node is seen
+    share:   share of the maps that are corrupted; the others stay unchanged
+    noise:   metres; the standard deviation of the noise is uniform from 0 to this
+    missing: in half of the corrupted maps, the share of missing nodes is uniform from 0 to this
+    coarse:  share of the corrupted maps that keep only every second node
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -38,7 +38,7 @@ class CorruptionConfig:
 
 
 def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) -> Maps:
-    """Returns maps as sensors may see them, filled where nodes are missing; float32."""
+    """Corrupts maps at random as a sensor might, and fills missing nodes; float32."""
     result = np.array(maps, np.float32)
     for index in np.flatnonzero(rng.random(len(maps)) < config.share):
         one = result[index : index + 1]
@@ -64,7 +64,7 @@ def thinned(maps: Maps, share: float, rng: np.random.Generator) -> Maps:
 def upsampled(maps: Maps) -> Maps:
     """Keeps every second node and interpolates the others bilinearly.
 
-    maps: with an even number of cells along each edge
+    maps: must have an even number of cells along each edge
     """
     result = np.array(maps)
     result[:, 1:-1:2, ::2] = (maps[:, :-2:2, ::2] + maps[:, 2::2, ::2]) / 2
@@ -88,10 +88,10 @@ def filled(maps: Maps) -> Maps:
 
 
 def smoothed(maps: Maps, deviation: float) -> Maps:
-    """Smooths by a Gaussian; deviation: nodes."""
+    """Smooths maps with a Gaussian; deviation: nodes."""
     return ndimage.gaussian_filter(maps, (0, deviation, deviation), mode="nearest")
 
 
 def median(maps: Maps) -> Maps:
-    """Returns the median of each 3 x 3 nodes."""
+    """Replaces each height by the median of the 3 x 3 nodes around it."""
     return ndimage.median_filter(maps, (1, 3, 3), mode="nearest")

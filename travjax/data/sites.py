@@ -1,15 +1,16 @@
-"""Real maps as a data set: windows of sites, split so that no ground is trained on and tested on (SPEC section 11).
+"""Real maps as a data set: windows of sites, split so that training and test share no ground (SPEC section 11).
 
-What becomes of a window is decided in this order:
+Windows are assigned in this order:
 1. Windows with too many unknown nodes or without any known trajectory are left out.
-2. Windows of test sites, and those that lie wholly in a test strip, are for the test.
-3. Other windows nearer than the gap to a test window of the same ground are left out.
+2. Windows of test sites, and those that lie wholly in a test strip, are for testing.
+3. Other windows that are nearer than the gap to a test window on the same ground are left out.
 4. Windows of validation sites, and those that lie wholly in a validation strip, are for validation.
-5. Other windows that share ground with a validation window, be it the nodes of an edge, are left out.
-6. The rest is for training, and is also turned by 90, 180 and 270 degrees and labelled anew.
+5. Other windows that share ground with a validation window, even just the nodes of an edge, are left out.
+6. The rest is for training; copies rotated by 90, 180 and 270 degrees are added and labelled separately.
 
-Where windows lie is compared in their coordinates where files name the same system, and on the planet where they name
-two, with some metres of doubt. Local systems, and none, say nothing about that: each such file is a ground of its own.
+Positions of windows are compared in file coordinates where files name the same coordinate system, and on the planet,
+with a tolerance of some metres, where they name different ones. A file with a local system or none is not compared with
+others, and counts as separate ground.
 """
 
 from collections.abc import Iterator
@@ -36,7 +37,7 @@ from travjax.simulation.traverse import failures, packed, simulate
 
 
 class Assignment(IntEnum):
-    """What a window is used for, numbered as in SPLITS, or why it is left out; named as in SiteRecord."""
+    """The split of a window, numbered as in SPLITS, or the reason why it is left out; named as in SiteRecord."""
 
     TRAIN = 0
     VALIDATION = 1
@@ -47,20 +48,20 @@ class Assignment(IntEnum):
 
 
 TOLERANCE = 1e-6
-"""Metres by which places of windows may be off."""
+"""Metres by which positions of windows may be wrong."""
 
 DOUBT = 10.0
-"""Metres by which places of two coordinate systems may be off: by realisations of a frame, or for want of grids."""
+"""Metres by which positions in two coordinate systems may disagree: other frame realisations, missing grids."""
 
 
 def read(
     config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
 ) -> Dataset:
-    """Cuts, labels and splits the windows of the sites; those of a site follow each other, turned copies come last.
+    """Cuts, labels and splits the windows of the sites, site by site; rotated copies come last.
 
     on_progress is called with the number of maps that were labelled. Raises InputError when robot, actions and grid do
-    not fit together, when a file is missing, cannot be read or is given twice, and when no window of a site is left for
-    a split that was asked for.
+    not fit together, when a file is missing, cannot be read or is given twice, and when a site has no window left for a
+    split that was asked for.
     """
     node_table(robot, actions, grid)
     found = [_windows(site, config, grid) for site in config.site]
@@ -99,15 +100,15 @@ def read(
 
 
 def turned(heights: np.ndarray, quarter_turns: int) -> np.ndarray:
-    """Turns maps [..., rows, cols] anticlockwise about their centre, x to the east and y to the north."""
-    return np.rot90(heights, -quarter_turns, axes=(-2, -1))  # rows go north, so the other way round than printed
+    """Rotates maps [..., rows, cols] anticlockwise about their centre, with x to the east and y to the north."""
+    return np.rot90(heights, -quarter_turns, axes=(-2, -1))  # rows go north, so np.rot90 turns the other way
 
 
 @dataclass(frozen=True, eq=False)
 class _Candidates:
     """The windows of all sites.
 
-    found: of each site
+    found: the windows of each site
     """
 
     found: list[Windows]
@@ -118,19 +119,19 @@ class _Candidates:
 
     @cached_property
     def site(self) -> np.ndarray:
-        """Index of the site of each: [n]."""
+        """The index of the site of each window: [n]."""
         return np.repeat(np.arange(len(self.found)), [len(windows) for windows in self.found])
 
     @cached_property
     def system(self) -> np.ndarray:
-        """The coordinate system of each by its name, and a name of the site's own where it is local: [n]."""
+        """The name of the coordinate system of each window, or a name for the site where the system is local: [n]."""
         names = np.concatenate([windows.systems() for windows in self.found]).astype(object)
         own = [index for index, name in enumerate(names) if is_local(name or None)]
         names[own] = [f"site {site}" for site in self.site[own]]
         return names
 
     def batches(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yields the indices and the heights of some windows at a time, [k] and [k, rows, cols]."""
+        """Yields the indices [k] and heights [k, rows, cols] of a few windows at a time."""
         first = 0
         for windows in self.found:
             for start in range(0, len(windows), MAPS_AT_ONCE):
@@ -145,7 +146,7 @@ class _Candidates:
         return np.concatenate([self.found[one].read(which[sites == one] - first[one]) for one in np.unique(sites)])
 
     def places(self, size: float) -> dict[float, tuple[np.ndarray, np.ndarray]]:
-        """Returns the middles of all windows that lie on a planet, by its radius: indices [k] and metres [k, 3]."""
+        """Returns the centres of windows on each planet, by its radius: indices [k] and positions [k, 3] in metres."""
         found: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
         for name in dict.fromkeys(self.system):
             if not name.startswith("site "):
@@ -187,7 +188,7 @@ def _require_different(found: list[Windows]) -> None:
 def _labels(
     heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None
 ) -> np.ndarray:
-    """Labels maps: [n, t] uint8."""
+    """Simulates all trajectories of maps and returns their labels: [n, t] uint8."""
     labels = np.empty((len(heights), len(actions)), np.uint8)
     for start in range(0, len(heights), MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, len(heights)))
@@ -199,7 +200,7 @@ def _labels(
 
 
 def _assignments(config: SitesConfig, windows: _Candidates, known: np.ndarray, size: float) -> np.ndarray:
-    """Returns the Assignment of each window: [n] uint8. known: [n] bool, whether any trajectory is known."""
+    """Returns the Assignment of each window: [n] uint8; known: [n] bool, whether any trajectory is known."""
     asked = {split: _asked_for(split, config, windows, size) for split in ("validation", "test")}
     assignment = np.full(len(known), Assignment.TRAIN, np.uint8)
     assignment[~known] = Assignment.TOO_UNKNOWN
@@ -213,7 +214,7 @@ def _assignments(config: SitesConfig, windows: _Candidates, known: np.ndarray, s
 
 
 def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: float) -> np.ndarray:
-    """Tells which windows belong to sites of that split or lie in its strips: [n] bool."""
+    """Tells which windows belong to sites of a split or lie in its strips: [n] bool."""
     asked = np.zeros(len(windows.site), bool)
     for index, site in enumerate(config.site):
         members = windows.site == index
@@ -223,7 +224,7 @@ def _asked_for(split: str, config: SitesConfig, windows: _Candidates, size: floa
 
 
 def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
-    """Tells which windows [n, 2] of a site lie wholly in a strip along the outermost of them: [n] bool."""
+    """Tells which windows of a site, at [n, 2], lie wholly in a strip along its outermost windows: [n] bool."""
     if not strip:
         return np.zeros(len(origin), bool)
     side, metres = strip
@@ -235,8 +236,8 @@ def _in_strip(origin: np.ndarray, strip: Strip, size: float) -> np.ndarray:
 def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -> np.ndarray:
     """Tells which windows have one of the `others` [n] bool on the same ground within reach: [n] bool.
 
-    size:  of a window
-    reach: between the south-west nodes along the axis in which they lie farther apart; the size is where windows touch
+    size:  metres, edge of a window
+    reach: metres between south-west nodes, along the axis in which they lie farther apart; windows touch at `size`
     """
     from scipy.spatial import KDTree  # takes 0.2 s to import
 
@@ -247,7 +248,7 @@ def _near(windows: _Candidates, others: np.ndarray, size: float, reach: float) -
         near[here] = distance < reach
     if len(dict.fromkeys(windows.system)) == 1:
         return near
-    apart = reach + (np.sqrt(2) - 1) * size + DOUBT  # between middles, whichever way the windows are turned
+    apart = reach + (np.sqrt(2) - 1) * size + DOUBT  # between centres, whatever the rotation of the windows
     for index, xyz in windows.places(size).values():
         held = others[index]
         for system in dict.fromkeys(windows.system[index[held]]):
@@ -276,7 +277,7 @@ def _records(
 
 
 def _require_all(config: SitesConfig, records: tuple[SiteRecord, ...], found: list[Windows], size: float) -> None:
-    """Refuses a split that was asked for and has no window, saying what became of the site's."""
+    """Raises InputError if a requested split has no window, with the use that the site's windows were put to."""
     for site, record, windows in zip(config.site, records, found, strict=True):
         strips = {split: strip for split, strip in site.strips.items() if strip}
         for split in dict.fromkeys([*strips, site.split]):

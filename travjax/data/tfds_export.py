@@ -4,10 +4,10 @@
     source = tfds.builder("travjax", data_dir="runs/tfds").as_data_source("train")
     source[0]["elevation"]
 
-One example is one map: `elevation` [rows, cols] float32 metres, NaN unknown; `labels` [t] uint8, of each trajectory's
-byte bits 0 to 2 say that step, obstacle and tilt failed, bit 3 unknown, bits 4 to 7 that further events of the robot
-did; `style`, or the site of a real map; `seed` of its terrain; `map`, its index in the data set; of a real map `origin`
-and `quarter_turns` as in provenance.py. All that is not an array is in the builder's metadata.
+One example is one map: `elevation` [rows, cols] float32 metres, NaN unknown; `labels` [t] uint8, a byte per trajectory
+in which bits 0 to 2 mark failures by step, obstacle and tilt, bit 3 unknown ground, and bits 4 to 7 failures by further
+events of the robot; `style`, or the site of a real map; `seed` of the terrain; `map`, the index in the data set; for a
+real map also `origin` and `quarter_turns` as in provenance.py. Everything but the arrays is in the builder's metadata.
 """
 
 import shutil
@@ -31,17 +31,18 @@ ARRAY_OF = {
     "origin": "origin",
     "quarter_turns": "quarter_turns",
 }
-"""Which array of a data set a feature holds a row of."""
+"""The array of a data set that each feature holds a row of."""
 
 METADATA = "metadata.json"
 """The file in which tensorflow-datasets keeps a builder's metadata."""
 
 
 def export(dataset: Dataset, folder: str | Path, on_progress: Callable[[int], object] | None = None) -> None:
-    """Writes the data set as tensorflow-datasets keep it, below `folder`, whole or not at all; replaces an earlier one.
+    """Writes the data set in the format of tensorflow-datasets below `folder`, completely or not at all.
 
-    on_progress is called with the number of maps that were added. Splits without maps are left out. Raises InputError
-    when tensorflow-datasets is missing, when something else lies there, or when it cannot be written.
+    An earlier export is replaced. on_progress is called with the number of maps that were added. Splits without maps
+    are left out. Raises InputError when tensorflow-datasets is missing, when the folder holds something else, or when
+    the data set cannot be written.
     """
     tfds = _tensorflow_datasets()
     with atomic_write_folder(user_path(folder), _is_export) as temporary:
@@ -58,9 +59,9 @@ def export(dataset: Dataset, folder: str | Path, on_progress: Callable[[int], ob
 
 
 def read(folder: str | Path) -> Dataset:
-    """Reads back what `export` wrote to `folder`, equal to what was exported.
+    """Reads the data set that `export` wrote to `folder`; it equals the exported one.
 
-    Raises InputError when tensorflow-datasets is missing, when there is no such data set, or when it is damaged.
+    Raises InputError when tensorflow-datasets is missing, or when the data set is missing or damaged.
     """
     tfds = _tensorflow_datasets()
     folder = user_path(folder)
@@ -70,17 +71,17 @@ def read(folder: str | Path) -> Dataset:
     try:
         builder = tfds.builder_from_directory(place)
         return dataset_from_arrays(builder.info.metadata, _collected(builder))
-    except Exception as error:  # a damaged record raises whatever the reader of its format does
+    except Exception as error:  # the reader may raise anything on a damaged record
         raise InputError(f"{place}: damaged: {' '.join(str(error).split()) or type(error).__name__}") from None
 
 
 def _collected(builder: Any) -> dict[str, np.ndarray]:
-    """The arrays of the data set by name."""
+    """Collects the arrays of the data set by name."""
     splits, features = builder.info.splits, builder.info.features
     count = sum(split.num_examples for split in splits.values())
     kept = {array: name for name, array in ARRAY_OF.items() if name in features}
     arrays = {array: np.empty((count, *features[name].shape), features[name].np_dtype) for array, name in kept.items()}
-    split = np.full(count, len(SPLITS), np.uint8)  # no split: a map that is missing is found by it
+    split = np.full(count, len(SPLITS), np.uint8)  # not a split: marks maps that are missing
     group = [""] * count
     for name in splits:
         source = builder.as_data_source(name)
@@ -94,11 +95,11 @@ def _collected(builder: Any) -> dict[str, np.ndarray]:
 
 
 def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], object] | None) -> type:
-    """The builder of one data set; a class in a function, since its base is imported when it is needed."""
+    """Makes the builder class of one data set, in a function because its base class is imported only when needed."""
 
     class Information(tfds.core.DatasetInfo):
         def initialize_from_bucket(self) -> None:
-            """Asks no bucket on the network whether it knows the data set."""
+            """Does nothing, so that no bucket on the network is asked for the data set."""
 
     class Travjax(tfds.core.GeneratorBasedBuilder, skip_registration=True):  # type: ignore[call-arg]
         name = NAME
@@ -113,7 +114,7 @@ def _builder_class(tfds: Any, dataset: Dataset, on_progress: Callable[[int], obj
                 "map": tfds.features.Scalar(np.int64),
             }
             if dataset.provenance:
-                # Numbers that are not kept as bytes lose half of their digits.
+                # Encoded other than as bytes, float64 numbers would lose half of their digits.
                 features["origin"] = tfds.features.Tensor(shape=(2,), dtype=np.float64, encoding="bytes")
                 features["quarter_turns"] = tfds.features.Scalar(np.uint8)
             return Information(
@@ -148,7 +149,7 @@ def _example(dataset: Dataset, index: int) -> dict[str, Any]:
 
 
 def _is_export(folder: Path) -> bool:
-    """Whether the folder holds an exported data set and nothing else."""
+    """Tells whether the folder holds an exported data set and nothing else."""
     try:
         metadata = read_json(folder / NAME / VERSION / METADATA)
         described = isinstance(metadata, dict) and "travjax" in metadata
@@ -159,7 +160,7 @@ def _is_export(folder: Path) -> bool:
 
 def _tensorflow_datasets() -> Any:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # on import, its dependencies warn of each other
+        warnings.simplefilter("ignore")  # its dependencies warn about each other on import
         try:
             import tensorflow_datasets as tfds  # type: ignore[import-untyped]
         except ImportError as error:

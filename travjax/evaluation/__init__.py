@@ -1,5 +1,5 @@
-"""Scores, tables and figures, of synthetic and labelled maps too.
+"""Metrics, tables and figures of predictions, data sets and maps; the benchmark of simulator and terrain.
 
-In: maps, labels and predictions. Out: metrics, text, pictures, and how fast simulator and terrain are.
-Stands on matplotlib, which is imported where it is used, data/ and simulation/.
+In: maps, labels and predicted probabilities. Out: metrics, text tables, pictures, and timings.
+Stands on data/, simulation/ and terrain/, and on matplotlib, which is imported where it is used.
 """

@@ -1,4 +1,4 @@
-"""A predictor to beat that knows no wheels: a logistic regression on two numbers of the ground along the path."""
+"""A baseline predictor without a robot model: logistic regression on the slope and step of the ground on the path."""
 
 from dataclasses import dataclass
 
@@ -16,9 +16,9 @@ SAMPLES_AT_ONCE = 4096
 def slope_and_step(
     heights: Float[np.ndarray, "n rows cols"], samples: Samples, actions: ActionSpace, grid: Grid
 ) -> Float[np.ndarray, "k 2"]:
-    """Largest slope [rad] of the ground along the path, and largest change of its height from pose to pose [m].
+    """Returns the largest ground slope [rad] along each path, and the largest height change between poses [m].
 
-    Both at the nodes nearest to the robot's centre; unknown ground does not count.
+    Both are taken at the nodes nearest to the robot's centre; unknown ground is ignored.
     """
     place = np.floor(actions.poses(np.arange(len(actions)))[..., :2] / grid.spacing + grid.cells / 2 + 0.5).astype(int)
     result = np.empty((len(samples[0]), 2))
@@ -36,7 +36,7 @@ def slope_and_step(
 
 @dataclass(frozen=True)
 class LogisticRegression:
-    """Probability of each event from features [k, f]: sigmoid(weights . features / scale + bias).
+    """Predicts the probability of each event from features [k, f]: sigmoid(weights . features / scale + bias).
 
     weights: [3, f + 1], the bias last; scale: [f] standard deviations of the training features
     """
@@ -46,7 +46,7 @@ class LogisticRegression:
 
     @staticmethod
     def fit(features: Float[np.ndarray, "k f"], failed: Bool[np.ndarray, "k 3"]) -> "LogisticRegression":
-        """Of the largest likelihood, with a penalty too small to matter where the events are not separable."""
+        """Fits by maximum likelihood, with a penalty that matters only where the events are separable."""
         scale = np.maximum(features.std(axis=0), 1e-9)
         inputs = _with_one(features / scale)
 
@@ -60,7 +60,7 @@ class LogisticRegression:
         return LogisticRegression(np.array(fitted), scale)
 
     def probabilities(self, features: Float[np.ndarray, "k f"]) -> Float[np.ndarray, "k 3"]:
-        """Probability of each event."""
+        """Returns the probability of each event for each sample."""
         return _sigmoid(_with_one(features / self.scale) @ self.weights.T)
 
 

@@ -1,6 +1,6 @@
-"""What a data set holds: failure shares of each group and split, and of its balanced subsets, beside the paper's.
+"""Tables about a data set: failure shares of its groups, splits and balanced subsets, beside the paper's shares.
 
-Counted from the packed labels a few maps at a time, since a data set of the paper's size has 173 million of them.
+Packed labels are counted a few maps at a time, since a data set of the paper's size has 173 million of them.
 """
 
 from collections.abc import Iterator
@@ -32,20 +32,20 @@ WINDOW_COLUMNS = {
 
 
 def columns_of(robot: Robot) -> dict[str, str]:
-    """Returns keys and headings of the columns of `statistics_table` for a robot's data set."""
+    """Returns the keys and headings of the columns of `statistics_table` for a robot's data set."""
     same = {name: name for name in ("maps", "samples", *robot.event_names, ANY)}
     return {"what": ""} | same | {"none": "maps with none", "known": "known"}
 
 
 def are_headings(line: str) -> bool:
-    """Tells whether a line is the first one of `statistics_table`, for a robot of any events."""
+    """Tells whether a line is the first line of `statistics_table`, whatever events the robot has."""
     first, last = ["maps", "samples", *EVENTS], [*ANY.split(), "maps", "with", "none", "known"]
     words = line.split()
     return words[: len(first)] == first and words[len(first) :][-len(last) :] == last
 
 
 def dataset_tables(dataset: Dataset) -> dict[str, str]:
-    """Returns tables by their headlines: the shares that fail and, of real maps, what became of the windows."""
+    """Returns tables by headline: the failure shares and, for real maps, how the windows were used."""
     in_paper = dataset.config is not None and as_in_paper(dataset.robot, dataset.actions)
     sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
     trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
@@ -59,14 +59,15 @@ def dataset_tables(dataset: Dataset) -> dict[str, str]:
 
 
 def are_statistics(path: Path) -> bool:
-    """Tells whether a file holds the tables of a data set: its first line is that of the headings."""
+    """Tells whether a file holds the tables of a data set: its first line must hold the headings."""
     return [are_headings(line) for line in first_lines(path, 1)] == [True]
 
 
 def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True) -> str:
-    """Failure shares of known trajectories for each group, split and subset, and the paper's if they compare.
+    """Tabulates failure shares of known trajectories for each group, split and subset.
 
-    subsets: what to call them, and their samples; the balanced subsets of training and validation unless given
+    subsets:     samples by name; the balanced subsets of training and validation unless given
+    as_in_paper: whether the paper's shares can be compared with these, and get a row
     """
     return rows_table(statistics_rows(dataset, subsets, as_in_paper), columns_of(dataset.robot))
 
@@ -74,7 +75,7 @@ def statistics_table(dataset: Dataset, subsets: dict[str, Samples] | None = None
 def statistics_rows(
     dataset: Dataset, subsets: dict[str, Samples] | None = None, as_in_paper: bool = True
 ) -> Iterator[dict]:
-    """The rows of `statistics_table`; a site of several splits has one for each of them as well."""
+    """Yields the rows of `statistics_table`; a site with several splits also has a row for each of them."""
     robot = dataset.robot
     counts = label_counts(dataset.labels, label_codes(len(robot.events)))
     for name in dict.fromkeys(dataset.group.tolist()):
@@ -94,7 +95,7 @@ def statistics_rows(
 
 
 def windows_table(provenance: Provenance) -> str:
-    """How each site was read, and how many of its windows are for each split or left out, and why."""
+    """Tabulates how each site was read, how many of its windows each split has, and how many were left out and why."""
     rows = [to_json(site) for site in provenance.sites]
     totals = {name: sum(row[name] for row in rows) for name in list(WINDOW_COLUMNS)[4:]}
     for row in rows:
@@ -105,14 +106,14 @@ def windows_table(provenance: Provenance) -> str:
 
 
 def balanced_subsets(dataset: Dataset) -> dict[str, Samples]:
-    """The fixed balanced subsets of training and validation."""
+    """Draws the fixed balanced subsets of training and validation."""
     seed = dataset.config.seed if dataset.config else 0
     splits = ("train", "validation")
     return {f"{name}, balanced": balanced_subset(dataset.labels, dataset.maps_of(name), seed) for name in splits}
 
 
 def label_counts(labels: np.ndarray, codes: int) -> np.ndarray:
-    """How often each label below `codes` occurs on each map: labels [n, t] uint8, result [n, codes]."""
+    """Counts how often each label below `codes` occurs on each map: labels [n, t] uint8, result [n, codes]."""
     counts = np.zeros((len(labels), codes), np.int64)
     for start in range(0, len(labels), MAPS_AT_ONCE):
         chunk = labels[start : start + MAPS_AT_ONCE]
@@ -123,7 +124,7 @@ def label_counts(labels: np.ndarray, codes: int) -> np.ndarray:
 
 
 def _row(name: str, counts: np.ndarray, robot: Robot) -> dict:
-    """The shares of maps with these counts [n, codes]."""
+    """Makes the table row of maps with these label counts [n, codes]."""
     codes = np.arange(counts.shape[1])
     known = counts[:, are_known(codes)].sum(axis=1)
     fails = counts[known > 0][:, are_known(codes) & (codes > 0)].sum(axis=1)
@@ -146,7 +147,7 @@ def _subset_row(name: str, labels: np.ndarray, samples: Samples, robot: Robot) -
 
 
 def _shares(counts: np.ndarray, robot: Robot) -> dict[str, str]:
-    """The share of each event and of any among known trajectories, from how often each label occurs: [codes]."""
+    """Formats the shares of known trajectories with each event and with any, from the label counts [codes]."""
     codes = np.arange(len(counts))
     total = counts[are_known(codes)].sum()
     wanted = {name: 1 << label_bit(event) for event, name in enumerate(robot.event_names)} | {ANY: FAILED}

@@ -1,6 +1,6 @@
-"""Every figure: maps, labelled action spaces, the robot and its action space, speed.
+"""Figures of maps, labelled action spaces, the robot and its action space, and speed.
 
-Functions return a matplotlib Figure; `save` writes it. Nothing here needs a display.
+Functions return a matplotlib Figure; `save` writes it. No display is needed.
 """
 
 import warnings
@@ -29,16 +29,16 @@ TERRAIN = "gist_earth"
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Writes a figure as PNG, whole or not at all; names in it are drawn as they are."""
+    """Writes a figure as PNG, completely or not at all; names in it are drawn literally."""
     _draw_texts_as_they_are(figure)
     with atomic_write(path) as temporary, warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from")  # of a name: a box is drawn
+        warnings.filterwarnings("ignore", "Glyph .* missing from")  # the font draws a box instead
         figure.savefig(temporary, format="png", dpi=150)
     return path
 
 
 def _draw_texts_as_they_are(figure: Figure) -> None:
-    """Takes no text for mathematics, such as a name with two $, but the numbers of axes, which are set in it."""
+    """Turns mathematics off in texts, such as a name with two $, except in the numbers of axes, which need it."""
     axes = [axis for ax in figure.axes for axis in (ax.xaxis, ax.yaxis)]
     numbers = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
     for text in figure.findobj(Text):
@@ -48,7 +48,7 @@ def _draw_texts_as_they_are(figure: Figure) -> None:
 
 
 def contact_sheet(heights: np.ndarray, titles: Sequence[str], heading: str, grid: Grid) -> Figure:
-    """Maps [n, rows, cols] side by side in one colour scale, shaded from the north-west."""
+    """Draws maps [n, rows, cols] side by side in one colour scale, shaded from the north-west."""
     columns = min(6, len(heights))
     rows = -(-len(heights) // columns)
     figure = Figure(figsize=(2.1 * columns + 1.2, 2.25 * rows + 0.6), layout="constrained")
@@ -75,9 +75,10 @@ def labelled_maps(
     actions: ActionSpace,
     grid: Grid,
 ) -> Figure:
-    """For each map the elevation and, for each event, the action space coloured safe, failed or unknown.
+    """Draws each map's elevation and, for each event, the action space coloured as safe, failed or unknown.
 
-    heights: [n, rows, cols]; failed: [n, t, k] of the robot's k events; known: [n, t]. The paper's qualitative figure.
+    heights: [n, rows, cols]; failed: [n, t, k] for the robot's k events; known: [n, t]
+    Source: the paper's qualitative figure.
     """
     paths = actions.poses(np.arange(len(actions)))[..., :2]
     columns = 1 + len(robot.events)
@@ -115,11 +116,11 @@ def predicted_maps(
     labelled: str = "true",
     every: int = 1,
 ) -> Figure:
-    """For each map the elevation and, for each event, the action space as predicted and in the last row as labelled.
+    """Draws each map's elevation and, for each event, the action space as predicted and, in the last row, as labelled.
 
-    heights: [n, rows, cols]; predictions: named probabilities [n, t, k] of the robot's k events, a row each; failed:
-    [n, t, k], None if that is not to be shown; known: [n, t]; labelled: what the last row is called; every: t are every
-    so many of the action space. The paper's qualitative figure.
+    heights: [n, rows, cols]; predictions: named probabilities [n, t, k] of the robot's k events, one row each; failed:
+    [n, t, k], or None to leave out the last row; known: [n, t]; labelled: name of the last row; every: step
+    of the trajectories in the action space that predictions are for. Source: the paper's qualitative figure.
     """
     paths = actions.poses(np.arange(0, len(actions), every))[..., :2]
     rows, columns = len(predictions) + (failed is not None), 1 + len(robot.events)
@@ -174,7 +175,7 @@ _KINDS = ((SAFE, "safe"), (FAILED, "failed"), (UNKNOWN_COLOUR, "unknown"))
 
 
 def _colour_range(heights: np.ndarray) -> tuple[float, float]:
-    """Lowest and highest height that gets a colour of its own; outliers share the ends."""
+    """Returns the lowest and highest height of the colour scale; outliers get the colours at its ends."""
     low, high = np.nanpercentile(heights, [0.5, 99.5]) if np.isfinite(heights).any() else (0.0, 1.0)
     return low, max(high, low + 1e-3)
 
@@ -192,7 +193,7 @@ def _draw_elevation(ax, heights, grid: Grid, low: float, high: float, colour: st
 
 
 def _by_label(failed: np.ndarray, known: np.ndarray) -> dict[str, np.ndarray]:
-    """Which trajectories have each colour, the last on top."""
+    """Returns the trajectories to draw in each colour; later colours are drawn on top."""
     return {UNKNOWN_COLOUR: ~known, SAFE: known & ~failed, FAILED: known & failed}
 
 
@@ -207,7 +208,7 @@ def _draw_paths(ax, paths: np.ndarray, by_colour: dict[str, np.ndarray]) -> None
 
 
 def _draw_robot(ax, robot: Robot) -> None:
-    """Chassis and wheels in plan, to scale, facing +y."""
+    """Draws chassis and wheels from above, to scale, facing +y."""
     for x, y in robot.wheel_positions():
         ax.add_patch(_box(x, y, robot.wheel_width, robot.wheel_diameter, facecolor="black"))
     ax.add_patch(
@@ -221,7 +222,7 @@ def _box(x: float, y: float, width: float, height: float, **style) -> Rectangle:
 
 
 def robot_figure(robot: Robot) -> Figure:
-    """The robot in plan and from the side, to scale, with the dimensions that the simulator uses."""
+    """Draws the robot from above and from the side, to scale, with the dimensions that the simulator uses."""
     figure = Figure(figsize=(12, 5.5), layout="constrained")
     plan, side = figure.subplots(1, 2)
     _draw_robot(plan, robot)
@@ -261,7 +262,7 @@ def robot_figure(robot: Robot) -> Figure:
 
 
 def _dimension(ax, start: tuple[float, float], end: tuple[float, float], name: str, offset: tuple[int, int]) -> None:
-    """An arrow with the length that it spans beside it, `offset` points away from its middle, or from its top end."""
+    """Draws a dimension arrow with its length, `offset` points from its middle or, for a vertical offset, its top."""
     length = float(np.hypot(end[0] - start[0], end[1] - start[1]))
     ax.annotate("", end, start, arrowprops=dict(arrowstyle="<->", shrinkA=0, shrinkB=0, color="tab:blue"))
     across = {1: "left", 0: "center", -1: "right"}[int(np.sign(offset[0]))]
@@ -273,7 +274,7 @@ def _dimension(ax, start: tuple[float, float], end: tuple[float, float], name: s
 
 
 def action_figure(actions: ActionSpace, robot: Robot, grid: Grid) -> Figure:
-    """The action space: the point turns, and all pairs of arcs after one of them (the paper's Fig. 3)."""
+    """Draws the action space: the point turns, and all pairs of arcs after one of them (the paper's Fig. 3)."""
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     whole, fan = figure.subplots(1, 2)
     paths = actions.poses(np.arange(len(actions)))[..., :2]
@@ -307,7 +308,7 @@ def action_figure(actions: ActionSpace, robot: Robot, grid: Grid) -> Figure:
 
 
 def speed_figure(rows: list[dict]) -> Figure:
-    """Milliseconds a map against the number of maps at once, from the rows of `bench`."""
+    """Plots milliseconds per map against the number of maps at once, from the rows of `bench`."""
     figure = Figure(figsize=(7, 4.5), layout="constrained")
     ax = figure.subplots()
     for what in dict.fromkeys(row["what"] for row in rows):
@@ -326,7 +327,7 @@ def speed_figure(rows: list[dict]) -> Figure:
 
 
 def timing_figure(rows: list[dict]) -> Figure:
-    """Seconds for all trajectories of a map as bars, from the rows of the experiment `timing`; grey: the paper's."""
+    """Draws bars of seconds per map from the rows of the experiment `timing`; the paper's are grey."""
     figure = Figure(figsize=(9, 0.6 * len(rows) + 1.2), layout="constrained")
     ax = figure.subplots()
     names = [f"{row['what']}\n{row['device']}" for row in rows]

@@ -1,4 +1,4 @@
-"""Synthetic maps and labelled maps as files of arrays, tables and figures."""
+"""Writes synthetic maps and labelled maps as files of arrays, tables and figures."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -17,15 +17,15 @@ from travjax.simulation.setup import setup_json
 from travjax.simulation.traverse import as_in_paper
 
 ON_SHEET = 24
-"""Maps on a contact sheet, at most."""
+"""The largest number of maps on a contact sheet."""
 
 
 def write_terrain(
     styles: Sequence[str], seeds: Sequence[int], grid: Grid, out: str | Path, world: float | None = None
 ) -> Path:
-    """Makes maps of each style with each of these seeds, and writes them and a contact sheet of each style.
+    """Makes maps of each style with each of these seeds, and writes them with a contact sheet of each style.
 
-    Returns the .npz of the maps. Raises InputError as `generate_terrain` does, and when `out` cannot be written to.
+    Returns the path of their .npz. Raises InputError as `generate_terrain` does, and when `out` cannot be written to.
     """
     from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
@@ -50,9 +50,9 @@ def write_terrain(
 def label_maps(
     maps: MapStream, robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, figures: bool = True
 ) -> Path:
-    """Labels every trajectory of maps, prints the shares that fail, and writes labels, shares and figures.
+    """Simulates every trajectory of maps, prints the shares that fail, and writes labels, shares and figures.
 
-    Returns the .npz of the labels. Raises InputError when they do not fit on the disk, or cannot be written.
+    Returns the path of the .npz of the labels. Raises InputError when they do not fit on the disk or cannot be written.
     """
     folder = output_folder(out)
     config = setup_json(robot, actions, grid, files=maps.files, world=maps.world)
@@ -75,7 +75,7 @@ def label_maps(
 
 
 def _counted(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]:
-    """Yields the batches, with a bar that counts their maps."""
+    """Yields the batches, with a progress bar that counts their maps."""
     with progress.bar(what, total, "map") as shown:
         for batch in batches:
             yield batch
@@ -83,7 +83,7 @@ def _counted(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]
 
 
 def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, out: Path) -> None:
-    """Draws labels of a few maps, the robot and the action space."""
+    """Draws and writes the labels of a few maps, the robot and the action space."""
     from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
     chosen = samples(maps)

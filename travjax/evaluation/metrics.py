@@ -1,7 +1,7 @@
-"""How good predicted probabilities are: confusion, recall, average precision, calibration (SPEC section 10).
+"""Metrics of predicted probabilities: confusion, recall, average precision, calibration (SPEC section 10).
 
-A sample is predicted to fail where its probability is at least the threshold, here and in everything that is printed.
-Probabilities and failures are [s, k], events in the order of the robot's; "overall" pools the events (micro-average).
+A sample is predicted to fail if its probability is at least the threshold, here and in everything that is printed.
+Probabilities and failures are [s, k], with events in the robot's order; "overall" pools the events (micro-average).
 Where no sample fails, recall, precision, F1 and average precision are undefined: NaN. Only NumPy is needed.
 """
 
@@ -20,18 +20,18 @@ OVERALL = "overall"
 NAMES = (*EVENTS, OVERALL)
 THRESHOLD = 0.5
 RECALLS = (0.9, 0.99)
-"""Recalls that thresholds are found for, unless others are asked for."""
+"""Recalls that thresholds are found for, unless others are given."""
 
 CURVE_POINTS = 300
-"""Points of a precision-recall curve that an Evaluation keeps."""
+"""The number of points of a precision-recall curve that an Evaluation keeps."""
 
 Columns = dict[str, tuple[np.ndarray, np.ndarray]]
-"""Probabilities and failures by event, and of all events together."""
+"""Probabilities and failures by event, and for all events together."""
 
 
 @dataclass(frozen=True)
 class Confusion:
-    """Counts of safe samples that are predicted safe (tn) or to fail (fp), and of failures likewise (fn, tp)."""
+    """Counts of safe samples predicted safe (tn) or failing (fp), and of failures predicted safe (fn), failing (tp)."""
 
     tn: int
     fp: int
@@ -60,7 +60,7 @@ class Confusion:
 
     @property
     def precision(self) -> float:
-        """NaN where nothing is predicted to fail, and where nothing fails, as the paper leaves it out there."""
+        """NaN if no sample is predicted to fail, and also if none fails, where the paper leaves it out."""
         return _ratio(self.tp, self.fp + self.tp) if self.fn + self.tp else math.nan
 
     @property
@@ -69,7 +69,7 @@ class Confusion:
 
 
 FIGURES = ("accuracy", "recall", "precision", "f1", "failures")
-"""What a confusion says, by the names of its properties."""
+"""Names of the properties of a confusion that are reported."""
 
 
 def _ratio(part: float, whole: float) -> float:
@@ -77,7 +77,7 @@ def _ratio(part: float, whole: float) -> float:
 
 
 def with_overall(confusions: Mapping[str, Confusion]) -> dict[str, Confusion]:
-    """The confusions of the events and "overall", their sum."""
+    """Adds "overall", the sum, to the confusions of the events."""
     return {**confusions, OVERALL: sum(confusions.values(), Confusion(0, 0, 0, 0))}
 
 
@@ -97,14 +97,14 @@ PAPER_REAL = with_overall(
         "tilt": Confusion(133735, 113, 0, 0),
     }
 )
-"""The paper's 44 real maps, with the network that was transferred to them."""
+"""The paper's 44 real maps, predicted by the network that was transferred to them."""
 
 
 @dataclass(frozen=True)
 class Curve:
     """Precision and recall at every threshold where the recall changes: the distinct probabilities of the failures.
 
-    threshold: [k] falling; precision, recall: [k], recall rising to 1. Empty where no sample fails.
+    threshold: [k] decreasing; precision, recall: [k], recall increasing to 1. Empty if no sample fails.
     """
 
     threshold: Float[np.ndarray, " k"]
@@ -113,20 +113,20 @@ class Curve:
 
     @property
     def average_precision(self) -> float:
-        """Mean precision over the recall, without interpolation: sum of (recall gained) x precision. NaN if empty."""
+        """Mean precision over recall without interpolation: the sum of recall increments x precision. NaN if empty."""
         if not len(self.recall):
             return math.nan
         return float(np.diff(self.recall, prepend=0) @ self.precision)
 
     def threshold_for_recall(self, recall: float) -> float:
-        """The highest threshold that reaches the recall; NaN where no sample fails."""
+        """Returns the highest threshold that reaches the recall; NaN if no sample fails."""
         require_number("recall", recall, 0, 1, "a share above 0 and at most 1")
         if not len(self.recall):
             return math.nan
         return float(self.threshold[np.searchsorted(self.recall, recall)])
 
     def thinned(self, points: int = CURVE_POINTS) -> "Curve":
-        """At most that many of its points, spread over it, both ends kept."""
+        """Keeps at most that many points, spread evenly over the curve, with both ends."""
         last = len(self.recall) - 1
         kept = np.unique(np.linspace(0, last, min(points, last + 1)).round().astype(int))
         return Curve(self.threshold[kept], self.precision[kept], self.recall[kept])
@@ -134,9 +134,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Predicted against observed: samples in bins of equal width by their probability.
+    """Predicted against observed failures: samples in bins of equal width by their probability.
 
-    count: [b] samples; probability: [b] their mean probability; observed: [b] the share that fails. NaN where empty.
+    count: [b] samples; probability: [b] their mean probability; observed: [b] share that fails. NaN in empty bins.
     """
 
     count: Int[np.ndarray, " b"]
@@ -145,19 +145,19 @@ class Calibration:
 
     @property
     def edges(self) -> np.ndarray:
-        """[b + 1] bounds of the bins; a probability on a bound belongs to the bin above it, 1 to the last one."""
+        """Bounds of the bins, [b + 1]; a probability on a bound belongs to the bin above it, 1 to the last bin."""
         return np.linspace(0, 1, len(self.count) + 1)
 
     @property
     def error(self) -> float:
-        """The expected calibration error (ECE): mean distance of probability and observed share over the samples."""
+        """The expected calibration error (ECE): mean distance of probability from observed share over the samples."""
         distance = np.abs(self.probability - self.observed)
         return float(np.nansum(self.count * distance) / self.count.sum())
 
 
 @dataclass(frozen=True)
 class Scores:
-    """Of one event, or overall: the confusion at the threshold, and the average precision."""
+    """The confusion at the threshold, and the average precision, of one event or overall."""
 
     confusion: Confusion
     average_precision: float
@@ -174,11 +174,11 @@ class OperatingPoint:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """All that is known of one predictor on one set of samples; the dicts go by event and "overall".
+    """All metrics of one predictor on one set of samples; the dicts have the keys of the events and "overall".
 
     any_failure: share of the samples with any failure; curves keep CURVE_POINTS points
-    points:      operating points for each wanted recall and for the paper's own, by rising recall
-    groups:      for each group of samples its scores by event and "overall"
+    points:      operating points at each wanted recall and at the paper's recall, by increasing recall
+    groups:      for each group of samples, scores by event and "overall"
     """
 
     samples: int
@@ -192,19 +192,19 @@ class Evaluation:
 
     @property
     def average_precision(self) -> dict[str, float]:
-        """By event, "overall", and "mean" over the events of which there are failures."""
+        """Average precision by event, "overall", and as "mean" over the events that have failures."""
         by_name = {name: scores.average_precision for name, scores in self.scores.items()}
         defined = [value for name, value in by_name.items() if name != OVERALL and not math.isnan(value)]
         return {**by_name, "mean": _ratio(sum(defined), len(defined))}
 
     @property
     def f1(self) -> dict[str, float]:
-        """By event and "overall"."""
+        """F1 by event and "overall"."""
         return {name: scores.confusion.f1 for name, scores in self.scores.items()}
 
 
 def confusion(probabilities: np.ndarray, failed: np.ndarray, threshold: float = THRESHOLD) -> Confusion:
-    """Counts all samples of arrays of one shape together; predicted to fail is probability >= threshold."""
+    """Counts the confusion of all elements of two arrays of one shape; probability >= threshold predicts failure."""
     predicted = probabilities >= threshold
     positive = int(np.count_nonzero(predicted))
     tp = int(np.count_nonzero(predicted & failed))
@@ -218,7 +218,7 @@ def confusions(
     threshold: float | Sequence[float] = THRESHOLD,
     events: Sequence[str] = EVENTS,
 ) -> dict[str, Confusion]:
-    """The confusion of each event, and overall; `threshold` is one for all or one an event, `events` their names."""
+    """Counts the confusion of each event, and overall; `threshold` is one for all events, or one for each."""
     thresholds = np.broadcast_to(threshold, len(events)).tolist()
     return with_overall(
         {name: confusion(probabilities[:, e], failed[:, e], thresholds[e]) for e, name in enumerate(events)}
@@ -226,7 +226,7 @@ def confusions(
 
 
 def precision_recall_curve(probabilities: np.ndarray, failed: np.ndarray) -> Curve:
-    """The curve of all samples of arrays of one shape together; equal probabilities pass a threshold together."""
+    """Computes the curve of all elements of two arrays of one shape; equal probabilities pass a threshold together."""
     failures, safe = np.sort(probabilities[failed]), np.sort(probabilities[~failed])
     threshold = np.unique(failures)[::-1]
     tp = len(failures) - np.searchsorted(failures, threshold)
@@ -235,17 +235,17 @@ def precision_recall_curve(probabilities: np.ndarray, failed: np.ndarray) -> Cur
 
 
 def average_precision(probabilities: np.ndarray, failed: np.ndarray) -> float:
-    """Average precision (scikit-learn's definition) of all samples of two arrays of one shape; NaN if none fails."""
+    """Computes average precision (scikit-learn's definition) over two arrays of one shape; NaN if nothing fails."""
     return precision_recall_curve(probabilities, failed).average_precision
 
 
 def threshold_for_recall(probabilities: np.ndarray, failed: np.ndarray, recall: float) -> float:
-    """The highest threshold at which probability >= threshold finds that share of the failures; NaN if none fails."""
+    """Returns the highest threshold at which predictions find that share of the failures; NaN if nothing fails."""
     return precision_recall_curve(probabilities, failed).threshold_for_recall(recall)
 
 
 def calibration(probabilities: np.ndarray, failed: np.ndarray, bins: int = 10) -> Calibration:
-    """Bins all samples of arrays of one shape together."""
+    """Bins all elements of two arrays of one shape by probability."""
     probability = np.ravel(probabilities).astype(np.float64)
     number = np.minimum((probability * bins).astype(np.int64), bins - 1)
     count = np.bincount(number, minlength=bins)
@@ -265,12 +265,12 @@ def evaluate(
     paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
     threshold: float = THRESHOLD,
 ) -> Evaluation:
-    """Everything about predicted probabilities [s, k] of samples whose failures [s, k] are known.
+    """Computes all metrics of predicted probabilities [s, k] of samples with known failures [s, k].
 
     groups:  [s] the group of each sample, such as its style
     events:  names of the k events
-    recalls: those to find thresholds for, beside the recalls of `paper`
-    Raises InputError when shapes differ, there is no sample, or a probability is not from 0 to 1.
+    recalls: recalls to find thresholds for, in addition to those of `paper`
+    Raises InputError when shapes differ, there is no sample, or a probability is outside 0 to 1.
     """
     probabilities, failed = _checked(probabilities, failed, len(events))
     columns = {name: (probabilities[:, e], failed[:, e]) for e, name in enumerate(events)}
@@ -291,7 +291,7 @@ def evaluate(
 
 
 def _recall_of(paper: Mapping[str, Confusion] | None, name: str) -> set[float]:
-    """The recall that the paper prints, if any."""
+    """Returns the recall that the paper reports, if any."""
     return {round(paper[name].recall, 3)} if paper and name in paper and paper[name].recall > 0 else set()
 
 
@@ -310,7 +310,7 @@ def _of_groups(columns: Columns, groups, threshold: float) -> dict[str, dict[str
 
 
 def _masks(members: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
-    """Each name and where it stands, in the order in which they come first; names are few, so nothing is sorted."""
+    """Yields each name and the mask of its members, by first appearance; names are few, so nothing is sorted."""
     left = np.ones(len(members), bool)
     while left.any():
         name = members[left.argmax()]
@@ -336,10 +336,7 @@ def _checked(probabilities, failed, events: int) -> tuple[np.ndarray, np.ndarray
 
 
 def json_ready(value):
-    """An Evaluation, or any part of one, as plain dicts, lists and numbers; what is not finite is None.
-
-    A confusion brings the figures of its counts, a calibration its error, an evaluation its average precisions.
-    """
+    """Converts an Evaluation or part of one, with derived figures, to dicts, lists and numbers; None if not finite."""
     if isinstance(value, np.ndarray | np.generic):
         return json_ready(value.tolist())
     if dataclasses.is_dataclass(value):

@@ -16,7 +16,7 @@ from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 
 COLOURS = ("tab:blue", "tab:orange", "tab:purple", "tab:green", "tab:red", "navy", "teal")
-"""Of a robot's events, in their order."""
+"""Colours of a robot's events, in their order."""
 
 BASELINES = ("tab:brown", "tab:olive", "tab:cyan", "tab:pink", "tab:gray")
 
@@ -26,9 +26,9 @@ def precision_recall_figure(
     paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC,
     baselines: Mapping[str, Evaluation] | None = None,
 ) -> Figure:
-    """Precision against recall of each event and overall, over lines of equal F1.
+    """Plots precision against recall for each event and overall, over lines of equal F1.
 
-    Marked are the threshold of the evaluation and where the paper stands. baselines: other predictors by name.
+    Marks the threshold of the evaluation and the result of the paper. baselines: other predictors by name.
     """
     rows, colours = math.ceil(len(evaluation.scores) / 2), _colours_of(evaluation.scores)
     figure = Figure(figsize=(13.5, 4.5 * rows), layout="constrained")
@@ -55,7 +55,7 @@ def precision_recall_figure(
 
 
 def _colours_of(names: Iterable[str]) -> dict[str, str]:
-    """A colour for each event, and black for "overall"."""
+    """Assigns a colour to each event, and black to "overall"."""
     colours = iter(COLOURS)
     return {name: "black" if name == OVERALL else next(colours) for name in names}
 
@@ -69,7 +69,7 @@ def _draw_equal_f1(ax) -> None:
 
 
 def _draw_curve(ax, curve: Curve, average_precision: float, label: str, **style) -> None:
-    """Steps, as average precision counts them: a precision holds for the recall gained to reach it."""
+    """Draws the steps that average precision sums: a precision applies to the recall gained up to its point."""
     if len(curve.recall):
         recall, precision = np.append(0, curve.recall), np.append(curve.precision[0], curve.precision)
         name = textwrap.fill(f"{label}, AP {average_precision:.3f}", 28)
@@ -79,7 +79,7 @@ def _draw_curve(ax, curve: Curve, average_precision: float, label: str, **style)
 
 
 def _draw_point(ax, counts: Confusion, marker: str, colour: str, label: str) -> None:
-    """Where a confusion stands; nothing where its precision or recall is undefined."""
+    """Marks precision and recall of a confusion, unless one of them is undefined."""
     if np.isfinite(counts.recall + counts.precision):
         size = 12 if marker == "*" else 7
         style = dict(color=colour, markersize=size, markeredgecolor="white", linestyle="none", clip_on=False, zorder=5)
@@ -87,7 +87,7 @@ def _draw_point(ax, counts: Confusion, marker: str, colour: str, label: str) -> 
 
 
 def reliability_figure(evaluation: Evaluation) -> Figure:
-    """Observed share of failures against predicted probability, of each event and overall; samples a bin below."""
+    """Plots observed failures against predicted probability for each event and overall, with samples per bin below."""
     colours = _colours_of(evaluation.scores)
     figure = Figure(figsize=(3.5 * len(colours), 5.2), layout="constrained")
     axes = figure.subplots(2, len(colours), sharex=True, sharey="row", height_ratios=(3, 1))
@@ -110,11 +110,11 @@ def reliability_figure(evaluation: Evaluation) -> Figure:
 
 
 def training_figure(rows: Sequence[Mapping], events: Sequence[str] = EVENTS) -> Figure:
-    """Losses, average precision, F1 and learning rate against the training step.
+    """Plots losses, average precision, F1 and learning rate against the training step.
 
     rows: as read from metrics.jsonl, in order. Keys `step`, `phase`, `loss`, `validation_loss`, `learning_rate`, and
-    `average_precision` and `f1` by event; a row may lack any but `step`, and what is no number is not drawn.
-    events: their names
+    `average_precision` and `f1` by event; a row may lack any key but `step`, and only numbers are drawn.
+    events: names of the events
     """
     figure = Figure(figsize=(12, 8), layout="constrained")
     axes = figure.subplots(2, 2, sharex=True)
@@ -140,7 +140,7 @@ def training_figure(rows: Sequence[Mapping], events: Sequence[str] = EVENTS) -> 
 
 
 def _series(rows: Sequence[Mapping], key: str, name: str | None = None) -> tuple[list, list]:
-    """Steps and values of the rows that have a number under the key, and under it the name."""
+    """Returns steps and values of the rows with a number under `key` (and `name` within it, if given)."""
     values = [(row["step"], row.get(key)) for row in rows]
     if name is not None:
         values = [(step, value.get(name)) for step, value in values if isinstance(value, Mapping)]
@@ -154,7 +154,7 @@ def _draw_series(ax, steps: list, values: list, **style) -> None:
 
 
 def _mark_phases(ax, rows: Sequence[Mapping]) -> None:
-    """A line where a phase of training begins, and its number."""
+    """Draws a line where a phase of training begins, with its number."""
     for before, after in pairwise(row for row in rows if type(row.get("phase")) is int):
         if before["phase"] != after["phase"]:
             ax.axvline(before["step"], color="0.4", linewidth=1, linestyle=":")
@@ -165,7 +165,7 @@ _PHASE = dict(xycoords=("data", "axes fraction"), textcoords="offset points", fo
 
 
 def input_channels_figure(images: np.ndarray, titles: Sequence[str], grid: Grid = Grid()) -> Figure:
-    """Network inputs, one sample a row: the three channels and the three as red, green and blue (the paper's Fig. 1).
+    """Draws network inputs, one sample per row: the three channels, then all three as RGB (the paper's Fig. 1).
 
     images: [k, rows, cols, 3] as `inputs.render_inputs` makes them
     """

@@ -1,6 +1,7 @@
-"""How fast: terrain and labelling for several batch sizes, beside the sequential simulator, in one run.
+"""Benchmark of terrain and labelling for several batch sizes, and of the sequential simulator, in one run.
 
-Medians of repeated calls on compiled code, compile time apart. `travjax bench` prints the table and writes it as TSV.
+Times are medians of repeated calls on compiled code; compile time is separate. `travjax bench` prints the table and
+writes it as TSV.
 """
 
 import os
@@ -46,7 +47,7 @@ SEQUENTIAL = "sequential NumPy simulator"
 
 
 def machine() -> str:
-    """Returns the device and versions that a figure belongs to, in one line."""
+    """Returns a line with the device and the versions that timings belong to."""
     device = jax.devices()[0]
     name = processor() if device.platform == "cpu" else device.device_kind
     versions = f"jax {jax.__version__}, Python {platform.python_version()}"
@@ -54,7 +55,7 @@ def machine() -> str:
 
 
 def processor() -> str:
-    """Returns the name of the processor, or its kind where the system does not tell."""
+    """Returns the name of the processor, or its architecture if the system does not give a name."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
@@ -64,7 +65,7 @@ def processor() -> str:
 
 
 def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    """Raises InputError when the sequential simulator refuses robot, actions and grid; `node_table` does so earlier."""
+    """Raises InputError when the sequential simulator refuses robot, actions and grid that `node_table` accepts."""
     try:
         for trajectory in range(0, len(actions), len(actions.radii) ** 2):
             reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)
@@ -77,13 +78,13 @@ def measure(
 ) -> None:
     """Measures terrain, labelling and the sequential simulator; prints the table and writes it as TSV and a figure.
 
-    repeats: timed calls of which the median is taken
-    stream:  maps to make and label besides, 0 for none
+    repeats: number of timed calls; the median is reported
+    stream:  number of maps to make and label in a stream as well, 0 for none
     Raises InputError as `check` does, and when nothing can be written to `out`.
     """
     check(robot, actions, grid)
     folder, rows = output_folder(out), [start_row()]
-    # First calls are to compile, not to read the cache.
+    # First calls must compile rather than read the cache.
     jax.config.update("jax_enable_compilation_cache", False)
     measured = kernel_rows(robot, actions, grid, repeats)
     rows += list(progress.bar("kernels", 2 * len(BATCHES), "row", iterable=measured))
@@ -99,7 +100,7 @@ def measure(
 
 
 def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
-    """Prints the table of measured rows with the machine, and writes it as TSV; columns: their headings."""
+    """Prints the table of measured rows under the machine, and writes it as TSV; columns: headings by key."""
     progress.say(f"\n{machine()}\n{rows_table(rows, columns)}\n")
     with atomic_write(path) as temporary:
         write_tsv(rows, temporary, columns)
@@ -107,7 +108,7 @@ def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
 
 
 def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
-    """Measures terrain and labelling on compiled code, a row for each batch size."""
+    """Measures terrain and labelling on compiled code, and yields a row for each batch size."""
     for maps in BATCHES:
         styles, seeds = _mixture(0, maps)
         make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
@@ -117,7 +118,7 @@ def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) ->
 
 
 def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
-    """Measures labelling of so many maps at once, on compiled code."""
+    """Measures labelling of this many maps at once, on compiled code."""
     heights = generate_terrain(*_mixture(0, maps), grid=grid)
     heights = heights[0] if maps == 1 else heights
     return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
@@ -126,9 +127,9 @@ def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, rep
 def reference_row(
     robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
 ) -> dict:
-    """Measures one whole map by the sequential simulator, one trajectory after the other.
+    """Measures the sequential simulator on all trajectories of one map.
 
-    on_progress: is told how many trajectories of a call are done
+    on_progress: called with the number of trajectories of a call that are done
     """
     heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
     seconds = []
@@ -140,7 +141,7 @@ def reference_row(
 
 
 def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
-    """Generates and labels that many maps, streamed in chunks, the labels kept in memory, one byte a trajectory."""
+    """Measures generating and labelling maps in chunks, with labels kept in memory at one byte per trajectory."""
     labels = np.empty((maps, len(actions)), np.uint8)
     start = time.perf_counter()
     for first in range(0, maps, STREAM_CHUNK):
@@ -153,7 +154,7 @@ def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_pro
 
 
 def start_row() -> dict:
-    """Measures a new process that labels one map, the compilation cache filled by an earlier process."""
+    """Measures a new process that labels one map, when an earlier process has filled the compilation cache."""
     seconds = []
     for _ in range(4):
         with tempfile.TemporaryDirectory() as folder:
@@ -167,14 +168,14 @@ def start_row() -> dict:
 
 
 def with_speed_up(rows: list[dict]) -> list[dict]:
-    """Returns the rows with how many times faster than the sequential simulator each labels a map."""
+    """Adds to each row how many times faster than the sequential simulator it labels a map."""
     sequential = next(row["ms_per_map"] for row in rows if row["what"] == SEQUENTIAL)
     simulates = lambda row: row["trajectories_per_s"] is not None
     return [row | {"speed_up": sequential / row["ms_per_map"] if simulates(row) else None} for row in rows]
 
 
 def write_tsv(rows: list[dict], path: Path, columns: Iterable[str] = COLUMNS) -> None:
-    """Writes a line for each row under the keys in `columns` and `machine`: this one, unless a row names its own."""
+    """Writes a line per row with the keys in `columns` and `machine`, which is this one unless the row has its own."""
     here = machine()
     cells = [
         [*("" if row[key] is None else str(row[key]) for key in columns), row.get("machine", here)] for row in rows

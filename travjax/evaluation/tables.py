@@ -1,4 +1,4 @@
-"""Printed tables."""
+"""Tables of failure shares and metrics, as text to print."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,11 +16,10 @@ PAPER_SHARES = {"step": 0.0623, "obstacle": 0.0550, "tilt": 0.0042, ANY: 0.096}
 """Shares of the paper's synthetic test trajectories that fail (SPEC section 10); its robot is not published in full."""
 
 AT_ONCE = 1024
-"""Maps whose flags are looked at together: they may lie on the disk."""
-
+"""Number of maps whose flags are read together: they may be on the disk."""
 
 TOLERANCE = 0.1
-"""By which the mean probability may differ from the frequency of failures and still be called right."""
+"""Share by which the mean probability may differ from the frequency of failures and still be called right."""
 
 
 def shares_table(
@@ -30,9 +29,10 @@ def shares_table(
     as_in_paper: bool = True,
     events: Sequence[str] = EVENTS,
 ) -> str:
-    """Shares of known trajectories that fail, for each group of maps and overall, the paper's below if they compare.
+    """Tabulates the shares of known trajectories that fail, for each group of maps and overall.
 
-    groups: [n] name of each map's group; failed: [n, t, k]; known: [n, t]; events: names of the k events
+    groups: [n] name of each map's group; failed: [n, t, k]; known: [n, t]; events: names of the k events; as_in_paper:
+    whether the paper's shares can be compared with these, and get a row
     """
     members: np.ndarray = np.asarray(groups)
     names = list(dict.fromkeys(groups))
@@ -49,13 +49,13 @@ def shares_table(
 
 
 def _failures(failed: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Of each map the known trajectories, those of them that fail by each event, and by any: [n, k + 2]."""
+    """Counts the known trajectories of each map, and those that fail by each event and by any: [n, k + 2]."""
     fails = np.asarray(failed) & np.asarray(known)[..., None]
     return np.column_stack([known.sum(axis=1), fails.sum(axis=1), fails.any(axis=-1).sum(axis=1)])
 
 
 def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
-    """The row of some maps, from what `_failures` says of them: [n, k + 2]."""
+    """Makes the table row of some maps from the counts of `_failures` [n, k + 2]."""
     known, *fails = counts.sum(axis=0)
     if not known:
         return [name, len(counts), *["-"] * counts.shape[1], "0.0%"]
@@ -70,7 +70,7 @@ def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
 
 
 def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:
-    """A table of dicts; columns maps keys to headings. None is left blank, numbers have four significant digits."""
+    """Tabulates dicts; `columns` maps keys to headings. None is left blank, numbers have four significant digits."""
     cells = [[_cell(row[key]) for key in columns] for row in rows]
     return _table(cells, list(columns.values()))
 
@@ -84,7 +84,7 @@ def _cell(value) -> str:
 
 
 def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
-    """Figures and counts of each event and overall, the paper's below each; a dash is explained below the table."""
+    """Tabulates metrics and counts of each event and overall, the paper's below each; notes explain dashes."""
     rows, notes = [], []
     for name, scores in evaluation.scores.items():
         precision, error = scores.average_precision, evaluation.calibration[name].error
@@ -98,7 +98,7 @@ def metrics_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None 
 
 
 def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | None = PAPER_SYNTHETIC) -> str:
-    """The highest threshold that reaches each recall, what it costs, and the paper's precision at its own recall."""
+    """Tabulates the highest threshold for each recall, the metrics there, and the paper's precision at its recall."""
     rows, notes = [], []
     for name, points in evaluation.points.items():
         for point in points:
@@ -113,7 +113,7 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
 
 
 def calibration_line(evaluation: Evaluation) -> str:
-    """One line: mean probability and measured frequency of failures, and whether probabilities are too high or low."""
+    """Compares mean probability with measured failure frequency in one line, and says which way they are off."""
     over = lambda bins, values: float(np.nansum(bins.count * values) / bins.count.sum())
     pairs = {
         name: (over(bins, bins.probability), over(bins, bins.observed)) for name, bins in evaluation.calibration.items()
@@ -130,7 +130,7 @@ def calibration_line(evaluation: Evaluation) -> str:
 
 
 def groups_table(evaluation: Evaluation) -> str:
-    """For each group its samples and, of each event, the share that fails, F1 and average precision."""
+    """Tabulates the samples of each group and, for each event, the share that fails, F1 and average precision."""
     rows = []
     undefined: dict[str, list[str]] = {name: [] for name in evaluation.scores if name != OVERALL}
     for group, scores in [*evaluation.groups.items(), ("all", evaluation.scores)]:
@@ -152,7 +152,7 @@ def groups_table(evaluation: Evaluation) -> str:
 
 
 def baselines_table(rows: Mapping[str, Mapping[str, float]]) -> str:
-    """Average precision of named predictors by event, overall and their mean, from `Evaluation.average_precision`."""
+    """Tabulates average precision of named predictors, as in `Evaluation.average_precision`."""
     columns = list(next(iter(rows.values())))
     undefined = [name for name in columns if any(math.isnan(values[name]) for values in rows.values())]
     cells = [[predictor, *(_share(values[name]) for name in columns)] for predictor, values in rows.items()]
@@ -178,7 +178,7 @@ def _is_of(paper: Confusion, point: OperatingPoint) -> bool:
 
 
 def _why_undefined(what: str, counts: Confusion) -> str:
-    """Why some figures of a confusion are a dash; nothing where none is."""
+    """Explains why some figures of a confusion are a dash; returns an empty text if none is."""
     if not counts.fn + counts.tp:
         return f"{what}: no sample fails, so the figures with a dash are undefined"
     if not counts.fp + counts.tp:
@@ -192,5 +192,5 @@ def _table(rows: list[list[str]], headers: Sequence[str]) -> str:
 
 
 def with_notes(table: str, notes: Iterable[str]) -> str:
-    """The table and below it what its dashes mean."""
+    """Adds notes, which explain dashes, below a table; empty notes are dropped."""
     return "\n".join([table, *(f"- {note}" for note in notes if note)])

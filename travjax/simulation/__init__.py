@@ -1,5 +1,5 @@
 """Traverse simulation: what happens to a robot on a map.
 
 In: heights of maps, a robot, an action space. Out: step, obstacle and tilt margins and failures of every trajectory.
-Stands on NumPy, JAX and the modules of travjax itself alone.
+Stands on NumPy, JAX and the top-level modules of travjax.
 """

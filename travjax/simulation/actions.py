@@ -23,12 +23,12 @@ def _paper_radii() -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class ActionSpace:
-    """All trajectories that are asked about.
+    """The set of trajectories that are simulated.
 
     turns:       number of point turns, evenly spread over the circle: 2 pi k / turns, anticlockwise
     arc_lengths: metres, first and second arc
-    radii:       metres, signed (+ turns left), inf is straight; each arc takes each of them
-    interval:    metres of path between simulated poses
+    radii:       metres, signed (+ turns left, inf is straight); both arcs use all of them
+    interval:    metres between simulated poses along the path
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -69,15 +69,15 @@ class ActionSpace:
         return load_toml(path, ActionSpace)
 
     def __len__(self) -> int:
-        """Number of trajectories: 3042 for the paper's action space."""
+        """Returns the number of trajectories: 3042 for the paper's action space."""
         return self.turns * len(self.radii) ** 2
 
     def index(self, turn, first, second):
-        """Trajectory index of a point turn and the two arcs' radii (their positions in `radii`)."""
+        """Returns the trajectory index of a point turn and of two radii, given by their positions in `radii`."""
         return (turn * len(self.radii) + first) * len(self.radii) + second
 
     def split(self, trajectory):
-        """The (turn, first, second) of a trajectory index; raises InputError when there is no such trajectory."""
+        """Splits a trajectory index into (turn, first, second); raises InputError when there is no such trajectory."""
         outside = np.ravel(trajectory)[(np.ravel(trajectory) < 0) | (np.ravel(trajectory) >= len(self))]
         require(not outside.size, "trajectory", outside[:1].tolist(), f"from 0 to {len(self) - 1}")
         arcs, second = np.divmod(trajectory, len(self.radii))
@@ -85,29 +85,29 @@ class ActionSpace:
         return turn, first, second
 
     def heading(self, turn):
-        """Heading after the point turn, radians."""
+        """Returns the heading after the point turn in radians."""
         return 2 * math.pi * np.asarray(turn) / self.turns
 
     def first_stations(self) -> np.ndarray:
-        """Path lengths of the poses along the first arc, its junction with the second included: [29] metres."""
+        """Returns the path lengths of the poses along the first arc, junction included: [29] metres."""
         return np.append(_stations(self.arc_lengths[0], self.interval), self.arc_lengths[0])
 
     def second_stations(self) -> np.ndarray:
-        """Path lengths of the poses along the second arc after the junction, its end included: [28] metres."""
+        """Returns the path lengths of the poses along the second arc, junction excluded: [28] metres."""
         return np.append(_stations(self.arc_lengths[1], self.interval)[1:], self.arc_lengths[1])
 
     def first_poses(self, turn, first) -> np.ndarray:
-        """Poses of first arcs: [..., 29, 3] for integer arrays `turn`, `first` [...]."""
+        """Computes the poses of first arcs: [..., 29, 3] for integer arrays `turn`, `first` [...]."""
         start = np.stack(np.broadcast_arrays(0.0, 0.0, self.heading(turn)), axis=-1)
         return arc_poses(start, np.asarray(self.radii)[first], self.first_stations())
 
     def second_poses(self, turn, first, second) -> np.ndarray:
-        """Poses of second arcs after the junction: [..., 28, 3] for integer arrays `turn`, `first`, `second` [...]."""
+        """Computes poses of second arcs after the junction: [..., 28, 3] for integers `turn`, `first`, `second`."""
         junction = self.first_poses(turn, first)[..., -1, :]
         return arc_poses(junction, np.asarray(self.radii)[second], self.second_stations())
 
     def poses(self, trajectory) -> np.ndarray:
-        """All simulated poses of trajectories: [..., 57, 3] for an integer array `trajectory` [...]."""
+        """Computes all simulated poses of trajectories: [..., 57, 3] for an integer array `trajectory` [...]."""
         turn, first, second = self.split(np.asarray(trajectory))
         return np.concatenate([self.first_poses(turn, first), self.second_poses(turn, first, second)], axis=-2)
 
@@ -117,7 +117,7 @@ def _stations(length: float, interval: float) -> np.ndarray:
 
 
 def arc_poses(start: np.ndarray, radius: np.ndarray, stations: np.ndarray) -> np.ndarray:
-    """Poses along arcs of signed radius (+ left, inf straight).
+    """Computes poses along arcs of signed radius (+ left, inf straight).
 
     start: [..., 3] x, y, heading; radius: [...] metres; stations: [s] metres along the path. Returns [..., s, 3].
     Source: SPEC section 4.

@@ -1,7 +1,7 @@
-"""Arrays as callers hand them over, whatever they are kept in, as NumPy arrays of numbers.
+"""Converts arrays of any library, as callers pass them, to NumPy arrays of numbers.
 
-Whatever NumPy reads as numbers is taken: any number type and byte order, lists of rows or of maps, tensors, tables.
-What it would lose on the way is kept: masked and missing values are NaN, and not what lies under the mask.
+Everything that NumPy reads as numbers is accepted: any number type and byte order, lists of rows or of maps, tensors,
+tables. Masked and missing values, which NumPy's own conversion would lose, become NaN.
 """
 
 import array
@@ -15,20 +15,22 @@ import numpy as np
 from travjax.config import InputError, require
 
 NESTED = 8
-"""Lists within lists, at most."""
+"""Lists may be nested at most this deep."""
 
 
 def numbers(name: str, values: Any, allowed: str = "numbers", depth: int = 0) -> np.ndarray:
     """Returns values on the host as numbers in the machine's byte order; masked and missing ones are NaN.
 
-    name, allowed: what an error calls them, and says that they must be; depth: of the lists that they are within
-    Raises InputError for what is no array of numbers.
+    name:    what errors call the values
+    allowed: what errors say the values must be
+    depth:   number of lists around the values
+    Raises InputError when the values are not an array of numbers.
     """
     if _is_sequence(values):
         return _stacked(name, values, allowed, depth)
     try:
         found = np.asanyarray(_of_tensor(values) if hasattr(values, "detach") else values)
-    except Exception as error:  # whatever the conversion of a foreign array raises
+    except Exception as error:  # the conversion of another library's array may raise anything
         reason = str(error).partition("\n")[0]
         raise InputError(f"{name}: {type(values).__name__} cannot be read as an array: {reason}") from None
     mask = np.ma.getmaskarray(found) if np.ma.isMaskedArray(found) else _own_mask(values, found.shape)
@@ -45,9 +47,9 @@ def numbers(name: str, values: Any, allowed: str = "numbers", depth: int = 0) ->
 
 
 def integers(name: str, values: Any, allowed: str, least: int, most: int) -> np.ndarray:
-    """Returns values as `numbers` does.
+    """Returns an array of integers from values of any kind, as `numbers` does.
 
-    Raises InputError unless they are integers from `least` to `most`, one or more.
+    Raises InputError unless there is at least one value and all are integers from `least` to `most`.
     """
     try:
         found = numbers(name, values)
@@ -59,16 +61,16 @@ def integers(name: str, values: Any, allowed: str, least: int, most: int) -> np.
 
 
 def are_numbers(dtype: Any) -> bool:
-    """Whether arrays of this type hold real numbers: no truth values, texts, times or complex numbers."""
+    """Tells whether arrays of this type hold real numbers: not booleans, texts, times or complex numbers."""
     if isinstance(dtype, np.dtype):
         dtype = dtype.newbyteorder("=")
-        if dtype.kind == "m":  # spans of time are integers to NumPy
+        if dtype.kind == "m":  # NumPy counts time spans as integers
             return False
     return jnp.issubdtype(dtype, jnp.number) and not jnp.issubdtype(dtype, jnp.complexfloating)
 
 
 def _is_sequence(values: Any) -> bool:
-    """Whether these are parts that have to be put together, and not an array, a text or a table."""
+    """Tells whether values are a sequence of parts to stack, rather than an array, a text or a table."""
     if isinstance(values, str | bytes | bytearray | memoryview | array.array):
         return False
     arrays = ("__array__", "__array_interface__", "__array_struct__", "keys")
@@ -79,7 +81,7 @@ def _is_sequence(values: Any) -> bool:
 def _stacked(name: str, parts: Sequence, allowed: str, depth: int) -> np.ndarray:
     if all(type(part) in (int, float) for part in parts):
         found = np.array(parts)
-        if found.dtype != object:  # of integers that no array holds
+        if found.dtype != object:  # an object array: the integers are too large for any number type
             return found
     if depth == NESTED:
         raise InputError(f"{name}: lists {NESTED} deep: must be {allowed} in rows")
@@ -91,20 +93,20 @@ def _stacked(name: str, parts: Sequence, allowed: str, depth: int) -> np.ndarray
 
 
 def _of_tensor(tensor: Any) -> Any:
-    """A tensor of torch as NumPy takes it, wherever it lies, and of a type that NumPy lacks as well."""
+    """Converts a torch tensor, on any device and also of a type that NumPy lacks, to what NumPy can read."""
     host = tensor.detach().cpu()
     kind = str(host.dtype).removeprefix("torch.")
     return np.asarray(host.float()).astype(jnp.dtype(kind)) if kind.startswith(("bfloat", "float8")) else host
 
 
 def _own_mask(values: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The mask, True where unknown, of an array that carries one and is not NumPy's own."""
+    """Returns the mask (True where unknown) of an array of another library, or None where it has none."""
     mask = getattr(values, "mask", None)
     return mask if isinstance(mask, np.ndarray) and mask.dtype == bool and mask.shape == shape else None
 
 
 def _number(name: str, value: Any, allowed: str) -> float:
-    """A single object of Python; None and what pandas has for missing are NaN."""
+    """Converts a single Python object to a number; None and the missing value of pandas become NaN."""
     if value is None or type(value).__name__ == "NAType":
         return np.nan
     number = None

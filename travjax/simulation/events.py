@@ -1,7 +1,7 @@
-"""Failure events: what is measured along a trajectory, and which of the robot's limits it is held against.
+"""Failure events: what is measured along a trajectory, and which limit of the robot it is compared with.
 
-An event is data. Labels, tables, figures and estimators take names and number of the events from the robot
-(`Robot.events`): the three of the paper, which every robot has, and those of OPTIONAL for which it gives a limit.
+An event is data. Labels, tables, figures and estimators take the names and the number of events from the robot
+(`Robot.events`): the paper's three, which every robot has, and those of OPTIONAL that the robot gives a limit for.
 """
 
 import math
@@ -18,10 +18,10 @@ from travjax.config import require
 
 @dataclass(frozen=True)
 class Pose:
-    """What the simulator knows of the robot at one pose; arrays of one shape, an element for each arc and map.
+    """The state of the robot at one pose; arrays of one shape with an element for each arc and map.
 
     contact:     metres, height of the ground under each of the wheels FL, FR, RL, RR
-    change:      metres, of each of them since the pose before; 0 at the first pose of a trajectory
+    change:      metres, change of each contact height since the previous pose; 0 at the first pose of a trajectory
     pitch, roll: slopes of the pose plane, forward and to the right
     steepness:   square of the pose plane's slope, pitch^2 + roll^2
     clearance:   metres, highest chassis node above the pose plane
@@ -41,10 +41,11 @@ class Event:
 
     name:   what labels, tables and figures call it
     unit:   of margin and limit, "m" or "rad"
-    limit:  the field of Robot that is the limit; a robot that leaves it None does not have the event
-    value:  of a pose; where two products are added in it, `travjax.batching.rounded` keeps its bits the same in any
-            batch
-    margin: of a trajectory, from the largest value of its poses, with which it grows; the value itself unless given
+    limit:  the field of Robot that holds the limit; a robot where it is None does not have the event
+    value:  computes the value at a pose; if it adds two products, `travjax.batching.rounded` keeps the result the
+            same to the bit in any batch
+    margin: computes the margin of a trajectory from the largest value at its poses, and must increase with it; the
+            margin is that value unless given
     """
 
     name: str
@@ -54,12 +55,12 @@ class Event:
     margin: Callable[[jax.Array], jax.Array] = lambda largest: largest
 
     def shown(self, margin: float) -> str:
-        """A margin, or an error of one, as it is printed: in metres or degrees."""
+        """Formats a margin, or an error of one, in metres or degrees."""
         return f"{math.degrees(margin):.2f} degrees" if self.unit == "rad" else f"{margin:.4f} {self.unit}"
 
 
 def larger(a: jax.Array, b: jax.Array) -> jax.Array:
-    """Maximum of numbers: one instruction, where jnp.maximum also looks for NaN."""
+    """Returns the larger of two numbers with one instruction; jnp.maximum also checks for NaN."""
     return jnp.where(a > b, a, b)
 
 
@@ -71,7 +72,7 @@ PAPER = (
 """The events of the paper (SPEC section 5), which every robot has."""
 
 OPTIONAL = (Event("roll", "rad", "max_roll", lambda pose: jnp.abs(pose.roll), jnp.arctan),)
-"""Events that a robot has if it gives their limit; at most four, since a label is one byte."""
+"""Events that a robot has if it gives a limit for them; at most four, since a label is one byte."""
 
 EVENTS = tuple(event.name for event in PAPER)
 """Names of the paper's events: those of most robots."""
@@ -84,14 +85,14 @@ EVENTS = tuple(event.name for event in PAPER)
 )
 @dataclass(frozen=True)
 class Margins:
-    """How far every trajectory goes towards each failure; NaN where unknown.
+    """The margin of every trajectory for each event; NaN where unknown.
 
     step:     [n, t] metres, largest change of a wheel's contact height between poses
     obstacle: [n, t] metres, largest height of ground under the chassis above the pose plane
     tilt:     [n, t] radians, largest slope of the pose plane
     known:    [n, t] False where wheels or chassis touch unknown ground
-    optional: [n, t] each, of the robot's further events
-    names:    of all its events; margins["roll"] is the margin of one
+    optional: margins of the robot's further events, [n, t] each
+    names:    names of all events of the robot; margins["roll"] is the margin of one
     """
 
     step: Float[Array, "*n t"]
@@ -102,27 +103,27 @@ class Margins:
     names: tuple[str, ...] = EVENTS
 
     def __getitem__(self, name: str) -> Float[Array, "*n t"]:
-        """The margin of an event; raises InputError where the robot does not have it."""
+        """Returns the margin of an event; raises InputError where the robot does not have it."""
         require(name in self.names, "event", name, f"one of the robot's: {', '.join(self.names)}")
         return (self.step, self.obstacle, self.tilt, *self.optional)[self.names.index(name)]
 
     def events(self) -> Float[Array, "*n t k"]:
-        """All margins in the order of the robot's events: step, obstacle, tilt first."""
+        """Stacks all margins in the order of the robot's events: step, obstacle, tilt first."""
         return jnp.stack([self[name] for name in self.names], axis=-1)
 
 
 UNKNOWN_LABEL = 0b0000_1000
-"""The bit of a label that says unknown."""
+"""The bit of a label that marks an unknown trajectory."""
 
 FAILED = 0b1111_0111
-"""The bits of a label that say that an event happens: bits 0 to 2 those of the paper, bits 4 to 7 optional ones."""
+"""The bits of a label that mark failures: bits 0 to 2 the paper's events, bits 4 to 7 the optional events."""
 
 
 def label_bit(event: int) -> int:
-    """The bit of a label that says that a robot's event of this number happens."""
+    """Returns the number of the bit in a label that marks a failure by the robot's event of this number."""
     return event if event < len(PAPER) else event + 1
 
 
 def label_codes(events: int) -> int:
-    """A label of so many events is a number below this: 16 for the paper's three."""
+    """Returns the number that all labels for so many events are below: 16 for the paper's three."""
     return 2 << events

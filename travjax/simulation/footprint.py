@@ -1,11 +1,11 @@
 """Which grid nodes the robot touches at every simulated pose: the static tables behind the traverse kernel.
 
-Poses of the action space -> the node under each wheel and the nodes under the chassis, as NumPy arrays that depend on
-robot geometry, action space and grid only (SPEC sections 4 and 5). Everything is computed in float64.
+Poses of the action space -> the node under each wheel and the nodes under the chassis, as NumPy arrays that depend only
+on robot geometry, action space and grid (SPEC sections 4 and 5). Everything is computed in float64.
 
-An even number of point turns maps the action space onto itself when the map is turned by 180 degrees, and a set of
-radii that comes in +- pairs does so when the map is mirrored. Tables are then needed for one arc of each orbit only,
-and the kernel simulates it on the map and on its turned and mirrored images side by side (the "views" below).
+With an even number of point turns the action space is symmetric under a rotation of the map by 180 degrees, and with
+radii in +- pairs under mirroring. Tables then need only one arc of each set of symmetric arcs (an orbit), and the
+kernel simulates it on the map and on its rotated and mirrored images side by side (the "views" below).
 
 Dimensions of arrays, here and in traverse.py:
 
@@ -36,7 +36,7 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
 TIE = 1e-9
-"""Slack (cells for wheels, metres for the chassis) so that ties do not hang on the rounding of sin and cos."""
+"""Slack (cells for wheels, metres for the chassis) so that ties do not depend on the rounding of sin and cos."""
 
 RUN = 4
 """Nodes side by side in one row that the kernel may read at once."""
@@ -44,18 +44,18 @@ RUN = 4
 
 @dataclass(frozen=True)
 class View:
-    """The map as it is, turned by 180 degrees, mirrored left to right, or both (turned first)."""
+    """The original map, or the map rotated by 180 degrees, mirrored left to right, or both (rotated first)."""
 
     turned: bool = False
     mirrored: bool = False
 
     @property
     def flipped(self) -> tuple[int, ...]:
-        """Axes of [row, col] that run the other way in this view."""
-        return (0,) * self.turned + (1,) * (self.turned != self.mirrored)
+        """The axes of [row, col] that are reversed in this view."""
+        return ((0,) if self.turned else ()) + ((1,) if self.turned != self.mirrored else ())
 
     def arc(self, turn, first, actions: ActionSpace):
-        """The (turn, first radius) of the map as it is that look like (turn, first) in this view."""
+        """Returns the (turn, first radius) on the original map that (turn, first) in this view corresponds to."""
         if self.mirrored:
             turn, first = -turn, _opposite(actions)[first]
         if self.turned:
@@ -63,11 +63,11 @@ class View:
         return turn % actions.turns, first
 
     def second(self, second, actions: ActionSpace):
-        """The second radius of the map as it is that looks like `second` in this view."""
+        """Returns the second radius on the original map that `second` in this view corresponds to."""
         return _opposite(actions)[second] if self.mirrored else second
 
     def trajectories(self, actions: ActionSpace) -> np.ndarray:
-        """The trajectory of the map as it is that looks like each one in this view: [t] indices."""
+        """Returns the trajectory on the original map that each one in this view corresponds to: [t] indices."""
         turn, first, second = actions.split(np.arange(len(actions)))
         turn, first = self.arc(turn, first, actions)
         return actions.index(turn, first, self.second(second, actions))
@@ -88,13 +88,13 @@ class Layout:
 class NodeTable:
     """Nodes and pose constants of first arcs and their second arcs; node = row * cols + col.
 
-    wheels:  [F, P, 4, V] int32 node under the wheels FL, FR, RL, RR, in the map as it is
+    wheels:  [F, P, 4, V] int32 node under the wheels FL, FR, RL, RR, on the original map
     centre:  [F, P] int32 node nearest to the robot's centre, in the view
-    offset:  [F, P, 2] float32 centre minus that node, (x, y) in cells
+    offset:  [F, P, 2] float32 vector from that node to the robot's centre, (x, y) in cells
     axes:    [F, P, 2] float32 cos and sin of the heading
     chassis: [F, P, 3, rows] int16 (row, first column, number of columns) of the nodes under the chassis, row by row,
              rows and columns counted from `centre`
-    source:  [T] int32 position of every trajectory in results flattened from [F, R, V]
+    source:  [T] int32 index of every trajectory in the flattened results [F, R, V]
     """
 
     wheels: np.ndarray
@@ -113,7 +113,7 @@ class NodeTable:
 
 @lru_cache(maxsize=8)
 def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
-    """Builds the table (0.1 s for the defaults, so it is not kept on disk).
+    """Builds the table of a robot, action space and grid (0.1 s for the defaults, so it is not kept on disk).
 
     Raises InputError when a radius turns inside the robot or a trajectory leaves the map.
     """
@@ -140,27 +140,27 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
 
 
 def _poses(actions: ActionSpace, turn: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Poses of first arcs [F] and of all their second arcs [R]: [F, S1 + R S2, 3]."""
+    """Computes the poses of first arcs [F] and of all their second arcs [R]: [F, S1 + R S2, 3]."""
     own = actions.first_poses(turn, first)
     following = actions.second_poses(turn[:, None], first[:, None], second)
     return np.concatenate([own, following.reshape(len(turn), -1, 3)], axis=1)
 
 
 def _opposite(actions: ActionSpace) -> np.ndarray:
-    """Position in `radii` of each radius with the other sign."""
+    """Returns, for each radius, the position in `radii` of the radius with the opposite sign."""
     radii = list(actions.radii)
     return np.array([i if math.isinf(r) else radii.index(-r) for i, r in enumerate(radii)])
 
 
 def views_of(actions: ActionSpace) -> tuple[View, ...]:
-    """The views under which an action space looks like itself; the map as it is comes first."""
+    """Returns the views under which an action space is symmetric; the original map comes first."""
     turned = (False, True) if actions.turns % 2 == 0 else (False,)
     paired = all(math.isinf(radius) or -radius in actions.radii for radius in actions.radii)
     return tuple(View(t, m) for m in ((False, True) if paired else (False,)) for t in turned)
 
 
 def _first_arcs(actions: ActionSpace, views: tuple[View, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """One (turn, first radius) of each orbit under the views: [F] each."""
+    """Picks one (turn, first radius) of each orbit under the views: [F] each."""
     seen: set[tuple[int, int]] = set()
     chosen = []
     for turn, first in product(range(actions.turns), range(len(actions.radii))):
@@ -183,7 +183,7 @@ def _source(actions: ActionSpace, views: tuple[View, ...], turn: np.ndarray, fir
 
 
 def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.ndarray:
-    """Nodes nearest to the wheels, [F, P, 4, V]; true poses view by view, since ties go to +x, +y of the true map."""
+    """Finds the nodes nearest to the wheels, [F, P, 4, V], view by view: ties go to +x, +y of the original map."""
     right, forward = np.array(robot.wheel_positions()).T
     nodes = []
     for view in views:
@@ -199,14 +199,14 @@ def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.nd
 
 
 def nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
-    """Row or column of the node nearest to a y or x [m], also where it lies off the map; ties go to +y, +x."""
+    """Returns the row or column of the node nearest to a y or x [m], even one off the map; ties go to +y, +x."""
     return np.floor(coordinate / grid.spacing + grid.cells / 2 + 0.5 + TIE).astype(int)
 
 
 def _chassis_rows(
     poses: np.ndarray, robot: Robot, grid: Grid, lengths: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The chassis nodes of each pose, row by row: row [P, rows], first column and number of columns [P, rows]."""
+    """Returns the chassis nodes of each pose row by row: row, first column and number of columns, [P, rows] each."""
     width, length = robot.chassis_width / 2 + TIE, robot.chassis_length / 2 + TIE
     reach = math.ceil(math.hypot(width, length) / grid.spacing)
     x, y, heading = (poses[:, axis, None] for axis in range(3))
@@ -230,7 +230,7 @@ def _chassis_rows(
 
 
 def _interval(factor: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of {dx: low <= factor * dx <= high}; low < high. Far away stands for infinite."""
+    """Returns the ends of {dx: low <= factor * dx <= high} for low < high; 1e6 stands for infinity."""
     factor = np.where(np.abs(factor) < 1e-12, 1e-12, factor)
     a, b = np.clip(low / factor, -1e6, 1e6), np.clip(high / factor, -1e6, 1e6)
     return np.minimum(a, b), np.maximum(a, b)
@@ -246,11 +246,11 @@ def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid, lengths: tuple[f
 
 
 def chassis_places(chassis: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarray]:
-    """Covers the chassis nodes of every pose by runs of `run` neighbours in a row, and single nodes where none fits.
+    """Covers the chassis nodes of every pose with runs of `run` neighbours in a row, and with single nodes elsewhere.
 
-    chassis: [F, P, 3, rows] as in NodeTable. Returns (runs [F, P, 2, K], singles [F, P, 2, M]), each the (row, column)
-    of a run's first node or of a single one; runs of a row may overlap, and a place that a pose does not need repeats
-    another one of its own. All nodes are single (K = 0) when `run` is 1 or some pose has no row that wide.
+    chassis: [F, P, 3, rows] as in NodeTable. Returns (runs [F, P, 2, K], singles [F, P, 2, M]): the (row, column) of
+    the first node of each run and of each single node. Runs in a row may overlap, and entries that a pose does not need
+    repeat another of its own. All nodes are single (K = 0) when `run` is 1 or some pose has no row that wide.
     """
     flat = chassis.reshape(-1, 3, chassis.shape[-1])
     row, start, count = flat.transpose(1, 0, 2)
@@ -264,7 +264,7 @@ def chassis_places(chassis: np.ndarray, run: int) -> tuple[np.ndarray, np.ndarra
 
 
 def _places(row: np.ndarray, start: np.ndarray, count: np.ndarray, run: int) -> np.ndarray:
-    """Places of `run` columns that cover [start, start + count) in each row: [P, 2, K] for [P, rows] arrays."""
+    """Covers [start, start + count) in each row with runs of `run` columns: [P, rows] arrays give [P, 2, K]."""
     places = -(-count // run)
     used = places.sum(axis=1)
     table = np.zeros((2, len(row), used.max()), np.int16)
@@ -281,5 +281,5 @@ def _places(row: np.ndarray, start: np.ndarray, count: np.ndarray, run: int) -> 
 
 
 def _counting(lengths: np.ndarray) -> np.ndarray:
-    """0, 1, ... for each length in turn: [2, 3] gives 0 1 0 1 2."""
+    """Counts from 0 for each length in turn: [2, 3] gives 0 1 0 1 2."""
     return np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)

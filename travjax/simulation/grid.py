@@ -1,6 +1,6 @@
 """The node grid of an elevation map (SPEC section 1).
 
-`heights[row, col]` stands at y = -size/2 + spacing * row (forward, north), x = -size/2 + spacing * col (right, east).
+`heights[row, col]` lies at y = -size/2 + spacing * row (forward, north), x = -size/2 + spacing * col (right, east).
 The robot starts at (0, 0) and faces +y.
 """
 
@@ -12,10 +12,10 @@ import numpy as np
 from travjax.config import require, require_length, require_number
 
 HIGHEST = 30_000.0
-"""Metres: what is higher, or as deep, is no height."""
+"""Metres: values above this, or below its negative, are not heights."""
 
 MARKERS = (-9999, -99999, -32768, 9999)
-"""Usual marks of unknown ground that some files and arrays do not declare."""
+"""Common markers of unknown ground, which some files and arrays use without declaring them."""
 
 
 @dataclass(frozen=True)

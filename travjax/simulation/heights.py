@@ -1,4 +1,4 @@
-"""Heights of maps as callers hand them over: checked, and as this package computes with them (SPEC section 1)."""
+"""Checks the heights of maps that callers pass, and converts them to float32 maps for the kernel (SPEC section 1)."""
 
 from typing import Any
 
@@ -12,19 +12,19 @@ from travjax.simulation.arrays import are_numbers, numbers
 from travjax.simulation.grid import HIGHEST, MARKERS, Grid, require_grid
 
 COARSEST = 0.05
-"""Metres: heights of a two-byte type in larger steps are refused; bfloat16 has them from 8 m on, float16 from 64 m."""
+"""Metres: coarser heights of a two-byte type are refused; bfloat16 is coarser from 8 m on, float16 from 64 m."""
 
 Heights = Float[Array, "*n rows cols"] | Float[np.ndarray, "*n rows cols"]
 
 
 def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool]:
-    """Returns checked float32 maps with a leading axis, and whether it was one map without that axis.
+    """Returns checked float32 maps with a leading axis, and whether the input was one map without that axis.
 
     float64 heights are taken relative to each map's centre before they become float32. Masked and missing nodes are
-    unknown. Heights of a jax array are not looked at, which would wait for the device: infinite or absurd ones, and
-    those that are a usual mark of unknown ground, are unknown.
-    Raises InputError when heights are not numbers in the grid's shape, and when those of any other array are infinite,
-    beyond 30 km, a usual mark of unknown ground (grid.MARKERS), or in steps larger than COARSEST.
+    unknown. The values of a jax array are not checked, since that would wait for the device: its infinite or absurd
+    heights, and those equal to a common marker of unknown ground, count as unknown.
+    Raises InputError when heights are not numbers in the grid's shape, and when heights of any other kind of array are
+    infinite, beyond 30 km, a common marker of unknown ground (grid.MARKERS), or in steps larger than COARSEST.
     """
     require_grid(grid)
     if not isinstance(heights, jax.Array):
@@ -54,7 +54,7 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
 
 @jax.jit
 def _unmarked(maps: jax.Array) -> jax.Array:
-    """Heights with NaN in place of the usual marks of unknown ground; on the device, nobody waits for it."""
+    """Replaces common markers of unknown ground by NaN; runs on the device, without waiting for the result."""
     heights = maps if maps.dtype == np.float64 else maps.astype(jnp.float32)
     marked = heights == MARKERS[0]
     for mark in MARKERS[1:]:
@@ -63,7 +63,7 @@ def _unmarked(maps: jax.Array) -> jax.Array:
 
 
 def require_close(maps: np.ndarray) -> None:
-    """Raises InputError for heights in a number type whose steps are coarse at that height: ground would be flat."""
+    """Raises InputError for heights whose number type has coarse steps at that height, so that ground would be flat."""
     if maps.dtype.kind in "iu" or maps.dtype.itemsize > 2:
         return
     values = np.abs(maps.astype(np.float32))
@@ -77,7 +77,7 @@ def require_close(maps: np.ndarray) -> None:
 
 
 def _require_ground(maps: np.ndarray) -> None:
-    """Raises InputError for heights that cannot be, and for marks of unknown ground that are not declared as such."""
+    """Raises InputError for impossible heights, and for undeclared markers of unknown ground."""
     exact = maps.dtype.itemsize > 2 or maps.dtype.kind in "iu"
     with np.errstate(over="ignore"):
         marks = np.asarray(MARKERS, np.float64) if exact else np.asarray(MARKERS).astype(maps.dtype).astype(np.float64)
@@ -94,7 +94,7 @@ def _require_ground(maps: np.ndarray) -> None:
 
 
 def _relative(maps, grid: Grid):
-    """Heights [n, rows, cols] relative to that of each map's centre, where it is known."""
+    """Returns heights [n, rows, cols] relative to the centre of each map, where the centre is known."""
     centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
     use = jnp if isinstance(maps, jax.Array) else np
     return maps - use.where(abs(centre) <= HIGHEST, centre, 0.0)

@@ -1,4 +1,4 @@
-"""Sequential float64 traverse simulator: oracle of the batched kernel and baseline of the benchmarks.
+"""Sequential float64 traverse simulator: the oracle for the batched kernel and the baseline of the benchmarks.
 
 It computes section 5 of the specification (static poses on a height map) for the action space of section 4
 in the frames of section 1, one trajectory and one pose at a time as the simulator of Visca et al. 2021 does.
@@ -44,7 +44,7 @@ UNKNOWN_MARGINS = TrajectoryMargins(step=math.nan, obstacle=math.nan, tilt=math.
 
 
 def poses(actions, trajectory: int) -> np.ndarray:
-    """Poses of one trajectory: [57, 3] with x, y in metres and the heading in radians (section 4).
+    """Computes the poses of one trajectory: [57, 3] with x, y in metres and the heading in radians (section 4).
 
     Raises ValueError for a trajectory index that the action space does not have.
     """
@@ -64,13 +64,13 @@ def poses(actions, trajectory: int) -> np.ndarray:
 
 
 def _distances(length: float, interval: float) -> np.ndarray:
-    """Distances of the poses along an arc, its end left out: multiples of the interval below the length."""
+    """Returns the distances of the poses along an arc without its end: multiples of the interval below the length."""
     multiples = interval * np.arange(math.ceil(length / interval) + 1)
     return multiples[multiples < length - ARC_END]
 
 
 def _along_arc(start: np.ndarray, radius: float, distances: np.ndarray) -> np.ndarray:
-    """Poses [n, 3] at `distances` [n] along an arc of signed radius (+ left, inf straight) from `start`."""
+    """Computes poses [n, 3] at `distances` [n] along an arc of signed radius (+ left, inf straight) from `start`."""
     x, y, heading = start
     if math.isinf(radius):
         forward, left, turned = distances, np.zeros_like(distances), np.zeros_like(distances)
@@ -84,11 +84,11 @@ def _along_arc(start: np.ndarray, radius: float, distances: np.ndarray) -> np.nd
 
 
 def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: float = 0.0625) -> TrajectoryMargins:
-    """Margins of one trajectory on one map (section 5).
+    """Simulates one trajectory on one map and returns its margins (section 5).
 
     heights: [rows, cols] metres, both odd, the centre node at x = y = 0; NaN is unknown ground.
 
-    Raises ValueError if the map has no centre node, or if the circle around wheels and chassis leaves it.
+    Raises ValueError if the map has no centre node, or if the circle around wheels and chassis leaves the map.
     """
     heights = _above_centre(heights)
     path = poses(actions, trajectory)
@@ -111,7 +111,7 @@ def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: flo
 
 
 def _above_centre(heights) -> np.ndarray:
-    """Heights relative to the centre node, or to any known node if that one is unknown; float64."""
+    """Returns float64 heights relative to the centre node, or to some known node if the centre is unknown."""
     heights = np.asarray(heights, dtype=np.float64)
     if heights.ndim != 2 or heights.shape[0] % 2 == 0 or heights.shape[1] % 2 == 0:
         raise ValueError(f"heights has shape {heights.shape}, allowed is [rows, cols], both odd")
@@ -123,7 +123,7 @@ def _above_centre(heights) -> np.ndarray:
 
 
 def _circumradius(robot) -> float:
-    """Radius of the circle around the robot's centre that holds the wheel centres and the chassis."""
+    """Returns the radius of the circle around the robot's centre that contains the wheel centres and the chassis."""
     wheels = math.hypot(robot.track, robot.wheelbase)
     return max(wheels, math.hypot(robot.chassis_width, robot.chassis_length)) / 2.0
 
@@ -137,7 +137,7 @@ def _check_on_map(heights: np.ndarray, robot, path: np.ndarray, cell_size: float
 
 
 def _wheel_contacts(heights, robot, x: float, y: float, heading: float, cell_size: float) -> list[float]:
-    """Heights of the nodes nearest to the wheel centres, in the order FL, FR, RL, RR."""
+    """Returns the heights of the nodes nearest to the wheel centres, in the order FL, FR, RL, RR."""
     sin, cos = math.sin(heading), math.cos(heading)
     rows, cols = heights.shape
     right, forward = robot.track / 2.0, robot.wheelbase / 2.0
@@ -154,7 +154,7 @@ def _nearest(coordinate: float) -> int:
 
 
 def _pose_plane(contacts: list[float], robot) -> tuple[float, float, float]:
-    """Least-squares plane of the contacts: centre height, roll slope (right), pitch slope (forward)."""
+    """Fits the least-squares plane to the contacts: centre height, roll slope (right), pitch slope (forward)."""
     front_left, front_right, rear_left, rear_right = contacts
     centre = (front_left + front_right + rear_left + rear_right) / 4.0
     roll_slope = ((front_right + rear_right) - (front_left + rear_left)) / (2.0 * robot.track)
@@ -163,7 +163,7 @@ def _pose_plane(contacts: list[float], robot) -> tuple[float, float, float]:
 
 
 def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: float, cell_size: float) -> float:
-    """Largest height above the pose plane of the nodes under the chassis; NaN if one of them is unknown."""
+    """Returns the largest height of a node under the chassis above the pose plane; NaN if one of them is unknown."""
     sin, cos = math.sin(heading), math.cos(heading)
     radius = _circumradius(robot)
     rows = _window(y, radius, heights.shape[0], cell_size)
@@ -180,7 +180,7 @@ def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: flo
 
 
 def _window(position: float, radius: float, nodes: int, cell_size: float) -> slice:
-    """The nodes of one axis within `radius` of `position`, and one more on either side against rounding."""
+    """Returns the nodes of one axis within `radius` of `position`, and one more on either side against rounding."""
     first = math.ceil((position - radius) / cell_size) + nodes // 2 - 1
     last = math.floor((position + radius) / cell_size) + nodes // 2 + 1
     return slice(max(first, 0), min(last, nodes - 1) + 1)
@@ -194,9 +194,9 @@ def simulate(
     cell_size: float = 0.0625,
     on_progress: Callable[[int], object] | None = None,
 ) -> Margins:
-    """Margins of the trajectories asked for (all unless given), one after the other, on one map (section 5).
+    """Simulates trajectories (all unless given) one after the other on one map, and returns their margins (section 5).
 
-    heights: [rows, cols] metres; `on_progress` gets the number of trajectories done after each of them.
+    heights: [rows, cols] metres; `on_progress` is called after each trajectory with the number done so far.
 
     Raises ValueError as simulate_trajectory does.
     """
@@ -216,7 +216,7 @@ def simulate(
 
 
 def label(margins: Margins, robot) -> np.ndarray:
-    """Failures [n, 3] bool in the order (step, obstacle, tilt), False where unknown (section 5)."""
+    """Returns failures [n, 3] bool in the order (step, obstacle, tilt), False where unknown (section 5)."""
     failed = np.stack(
         [
             margins.step > robot.max_step,

@@ -10,7 +10,7 @@ from travjax.simulation.events import OPTIONAL, PAPER, Event
 PRESETS = Path(__file__).parent / "robots"
 
 LONGEST_NAME = 100
-"""Characters."""
+"""Characters that a robot's name may have at most."""
 
 
 @dataclass(frozen=True)
@@ -19,16 +19,16 @@ class Robot:
 
     name:           what tables and figures call it, in one line
     wheelbase:      front to rear wheel centres
-    track:          left to right wheel centres; beside and below the chassis the wheels stay out of it
+    track:          left to right wheel centres; the wheels must not be inside the chassis
     wheel_diameter, wheel_width
-    chassis_length, chassis_width: the body that can hit the ground, centred on the wheels
+    chassis_length, chassis_width: the body that can hit the ground, centred between the wheels
     overall_length, overall_width: outer dimensions, for pictures
     ride_height:    ground clearance under the chassis: the limit of the obstacle margin
     max_step:       limit of the step margin
     max_tilt:       limit of the tilt margin, radians
     max_roll:       limit of the roll margin, the largest sideways slope of the pose plane as an angle, radians. Without
-                    it, as in the paper, a robot has no roll event; with it labels, tables, figures and estimators have
-                    the event after the other three
+                    it, as in the paper, a robot has no roll event; with it, roll is a fourth event of labels, tables,
+                    figures and estimators
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -62,7 +62,7 @@ class Robot:
         self._require_wheels_outside()
 
     def _require_wheels_outside(self) -> None:
-        """Refuses wheels that would be inside the chassis: beside, along and in height."""
+        """Raises InputError when the wheels would overlap the chassis in width, length and height."""
         least = self.chassis_width + self.wheel_width
         along = self.wheelbase - self.wheel_diameter < self.chassis_length
         inside = self.track < least - 1e-9 and along and self.ride_height < self.wheel_diameter
@@ -71,7 +71,7 @@ class Robot:
 
     @staticmethod
     def load(source: "str | Path | Robot") -> "Robot":
-        """A preset by name ("seekur_jr"), or a TOML file by path.
+        """Loads a preset by name ("seekur_jr"), or a TOML file by path.
 
         Raises InputError when there is no such preset or file, or when the file is wrong.
         """
@@ -87,25 +87,25 @@ class Robot:
 
     @staticmethod
     def presets() -> list[str]:
-        """Names of the robots that come with the package."""
+        """Returns the names of the robots that come with the package."""
         return sorted(path.stem for path in PRESETS.glob("*.toml"))
 
     @property
     def events(self) -> tuple[Event, ...]:
-        """The ways to fail that this robot has limits for; step, obstacle and tilt come first."""
+        """The failure events that this robot has limits for; step, obstacle and tilt come first."""
         return PAPER + tuple(event for event in OPTIONAL if getattr(self, event.limit) is not None)
 
     @property
     def event_names(self) -> tuple[str, ...]:
-        """What labels, tables and figures call its events."""
+        """The names of the robot's events in labels, tables and figures."""
         return tuple(event.name for event in self.events)
 
     @property
     def limits(self) -> tuple[float, ...]:
-        """Largest allowed margin of each event: step [m], obstacle [m], tilt [rad]."""
+        """The largest allowed margin of each event: step [m], obstacle [m], tilt [rad]."""
         return tuple(getattr(self, event.limit) for event in self.events)
 
     def wheel_positions(self) -> tuple[tuple[float, float], ...]:
-        """(right, forward) of the wheels FL, FR, RL, RR, metres."""
+        """Returns the positions (right, forward) of the wheels FL, FR, RL, RR in metres."""
         right, forward = self.track / 2, self.wheelbase / 2
         return (-right, forward), (right, forward), (-right, -forward), (right, -forward)

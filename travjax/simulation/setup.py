@@ -1,4 +1,4 @@
-"""Robot, action space and map together: what a label holds for."""
+"""The setup that labels are valid for: robot, action space and map grid together."""
 
 import json
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from travjax.simulation.robot import Robot
 def load_setup(
     robot: str | Path, actions: str | Path | None = None, size: float = 8.0, spacing: float = 0.0625
 ) -> tuple[Grid, Robot, ActionSpace]:
-    """Reads a robot and an action space, and checks that they fit the map before anything is made.
+    """Reads a robot and an action space, and checks that they fit the map before any work is done.
 
     robot:   name of a robot that comes with the package, or a TOML file
     actions: TOML file of an action space, the paper's unless given
@@ -33,6 +33,6 @@ def load_setup(
 
 
 def setup_json(robot: Robot, actions: ActionSpace, grid: Grid, **more: Any) -> str:
-    """Returns all that labels depend on as JSON, with the version of travjax; a straight arc's radius is "inf"."""
+    """Returns everything labels depend on as JSON, with the version of travjax; a straight arc's radius is "inf"."""
     parts = {name: to_json(part) for name, part in (("robot", robot), ("actions", actions), ("grid", grid))}
     return json.dumps(parts | more | {"travjax": version("travjax")}, allow_nan=False)

@@ -3,9 +3,9 @@
 heights -> the four wheel contacts and the pose plane at each pose -> largest step, obstacle and tilt of each arc ->
 margins of all trajectories -> failures. First arcs are simulated once for all the second arcs that follow them.
 
-On the machine the maps of a batch and their views (footprint.py) lie side by side as the fastest axis, the "lanes", so
-that one table entry reads one row of memory, and a few first arcs at a time are simulated so that their poses stay in
-the cache. BUILD_NOTES.md has what was measured to arrive here, footprint.py what the letters in shapes stand for.
+In memory the maps of a batch and their views (footprint.py) lie side by side as the fastest axis, the "lanes", so that
+one table entry reads one row of memory. A few first arcs are simulated at a time, so that their poses stay in the
+cache. BUILD_NOTES.md has the measurements behind this layout; footprint.py explains the letters in shapes.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
 
 FEW_MAPS = 2
-"""Up to this many maps, RUN neighbouring nodes are read at once: the lanes alone would not fill a vector register."""
+"""For up to this many maps, RUN neighbouring nodes are read at once: the lanes alone do not fill a vector register."""
 
 POSES_AT_ONCE = 200_000
 """Poses times lanes that a CPU simulates at once: a float32 array of them fits in the second-level cache of a core."""
@@ -37,27 +37,27 @@ NODES_AT_ONCE = 8
 """Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
 
 UNKNOWN_HEIGHT = 1e30
-"""Stands for an unknown height inside the kernel: a maximum keeps it, where NaN would need a second pass."""
+"""Stands for an unknown height inside the kernel: a maximum keeps it, whereas NaN would need a second pass."""
 
 
 @lru_cache(maxsize=1)
 def default_robot() -> Robot:
-    """The Seekur Jr, the paper's robot."""
+    """Returns the Seekur Jr, the paper's robot."""
     return Robot.load("seekur_jr")
 
 
 def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
-    """Whether these are the paper's, so that figures on synthetic maps compare with its own."""
+    """Tells whether both are the paper's, so that figures on synthetic maps can be compared with the paper's."""
     return robot == default_robot() and actions == ActionSpace()
 
 
 def chosen_robot(robot: Robot | str | None) -> Robot:
-    """The robot that an argument names: the default one for None, else as `Robot.load` takes it."""
+    """Returns the default robot for None, else the robot that `Robot.load` makes of the argument."""
     return default_robot() if robot is None else Robot.load(robot)
 
 
 def chosen_actions(actions: ActionSpace | None) -> ActionSpace:
-    """The action space that an argument gives: the paper's for None. Raises InputError for anything else."""
+    """Returns the paper's action space for None, else the given one; raises InputError if it is no ActionSpace."""
     require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
     return ActionSpace() if actions is None else actions
 
@@ -70,17 +70,17 @@ def simulate(
     *,
     grid: Grid = Grid(),
 ) -> Margins:
-    """Margins of every trajectory on every map.
+    """Simulates every trajectory on every map, and returns the margins.
 
     heights: [n, rows, cols] or [rows, cols] metres, NaN or masked where unknown; laid out as in grid.py. Any array of
-             numbers, or lists of them; float64 heights are taken relative to the map's centre before they become
+             numbers, or nested lists; float64 heights are taken relative to the map's centre before they become
              float32, so a site at 2000 m loses nothing
     robot:   a Robot, or the name or file of one; the Seekur Jr unless given
     actions: the paper's action space unless given
     Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
-    Raises InputError when heights have another shape than the grid or are not numbers, when they are infinite, beyond
-    30 km or a usual mark of unknown ground such as -9999 (but for a jax array, which is not looked at: what is infinite
-    or beyond is unknown there), and when a trajectory leaves the map or turns inside the robot.
+    Raises InputError when heights do not have the grid's shape or are not numbers, when they are infinite, beyond 30 km
+    or a common marker of unknown ground such as -9999 (in a jax array, whose values are not checked, such heights count
+    as unknown), and when a trajectory leaves the map or turns inside the robot.
     """
     maps, alone = as_maps(heights, grid)
     robot, actions = chosen_robot(robot), chosen_actions(actions)
@@ -96,9 +96,9 @@ def simulate(
 
 @usual_flags()
 def failures(margins: Margins, robot: Robot | str | None = None) -> Bool[Array, "*n t k"]:
-    """Which margins exceed the robot's limits, in the order of its events; False where unknown.
+    """Tells which margins exceed the robot's limits, in the order of its events; False where unknown.
 
-    Raises InputError when the margins lack one of its events.
+    Raises InputError when the margins lack one of the robot's events.
     """
     robot = chosen_robot(robot)
     chosen = jnp.stack([margins[name] for name in robot.event_names], axis=-1)
@@ -113,10 +113,10 @@ def label(
     *,
     grid: Grid = Grid(),
 ) -> Bool[Array, "*n t k"]:
-    """Failures of every trajectory on every map; arguments and errors of `simulate`.
+    """Tells which trajectories fail on every map; takes the arguments and raises the errors of `simulate`.
 
-    Returns [n, t, 3] of step, obstacle and tilt; more where the robot has limits for further events. False where a
-    trajectory is unknown as well: read it together with `simulate(...).known`.
+    Returns [n, t, 3] for step, obstacle and tilt, and more columns where the robot has limits for further events. Also
+    False where a trajectory is unknown, so read it together with `simulate(...).known`.
     """
     return failures(simulate(heights, robot, actions, grid=grid), robot)
 
@@ -124,14 +124,14 @@ def label(
 @usual_flags()
 @jax.jit
 def packed(failed: Bool[Array, "*n t k"], known: Bool[Array, "*n t"]) -> UInt8[Array, "*n t"]:
-    """Labels in one byte a trajectory: bits 0 to 2 step, obstacle and tilt, 3 unknown, 4 on further events."""
+    """Packs labels into a byte per trajectory: bits 0 to 2 step, obstacle and tilt, 3 unknown, 4 on further events."""
     bits = [failed[..., event].astype(jnp.uint8) << label_bit(event) for event in range(failed.shape[-1])]
     return reduce(jnp.bitwise_or, bits, jnp.where(known, jnp.uint8(0), jnp.uint8(UNKNOWN_LABEL)))
 
 
 @usual_flags()
 def unpacked(labels, robot: Robot | str | None = None) -> tuple[Bool[Array, "*n t k"], Bool[Array, "*n t"]]:
-    """The (failed, known) that `packed` was given, from its labels of a robot: [n, t] uint8."""
+    """Unpacks labels that `packed` made for a robot, [n, t] uint8, into (failed, known)."""
     labels, count = jnp.asarray(labels), len(chosen_robot(robot).events)
     bits = jnp.array([1 << label_bit(event) for event in range(count)], jnp.uint8)
     return (labels[..., None] & bits) > 0, (labels & UNKNOWN_LABEL) == 0
@@ -146,8 +146,8 @@ def unpacked(labels, robot: Robot | str | None = None) -> tuple[Bool[Array, "*n 
 class _Chunks:
     """The pose arrays of a NodeTable cut into chunks, laid out in the order in which they are read.
 
-    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], the steps
-    those of the kernel's scan
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], where steps
+    are those of the kernel's scan
     """
 
     wheels: jax.Array
@@ -160,7 +160,7 @@ class _Chunks:
 
 @lru_cache(maxsize=8)
 def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
-    """The chunks for batches of `maps` and the `source` of a NodeTable, on the device."""
+    """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device."""
     table = node_table(robot, actions, grid)
     runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
     arcs = len(table.centre)
@@ -172,7 +172,7 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
         array = np.concatenate([array, array[:1].repeat(padding, axis=0)])
         return array.reshape(len(array) // arcs, arcs * array.shape[1], *array.shape[2:])
 
-    with jax.ensure_compile_time_eval():  # arrays, and no tracers, when the caller is being traced
+    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
         chunks = _Chunks(
             wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
             centre=jnp.asarray(cut(table.centre)),
@@ -185,7 +185,7 @@ def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) ->
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
-    """[C, A P, 2, K] -> [C, steps, A P, 2, places], with about NODES_AT_ONCE places in a step."""
+    """Reorders [C, A P, 2, K] to [C, steps, A P, 2, places], with about NODES_AT_ONCE places in a step."""
     chunks, poses, _, count = places.shape
     steps = -(-count // NODES_AT_ONCE)
     places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
@@ -200,7 +200,7 @@ def _simulate(
     grid = layout.grid
     centre = maps[:, grid.cells // 2, grid.cells // 2, None, None]
     heights = jnp.where(jnp.abs(maps) <= HIGHEST, maps - jnp.where(jnp.isfinite(centre), centre, 0), UNKNOWN_HEIGHT)
-    # Without these barriers XLA computes both anew for every element that is gathered from them.
+    # Without these barriers XLA recomputes both arrays for every element that is gathered from them.
     by_node = jax.lax.optimization_barrier(heights.reshape(len(maps), -1).T)
     views = jax.lax.optimization_barrier(_view_lanes(by_node, layout.views, grid))
 
@@ -219,20 +219,20 @@ def _simulate(
 
 
 def _view_lanes(by_node: jax.Array, views: tuple[View, ...], grid: Grid) -> jax.Array:
-    """[nodes, lanes]: the map and its turned and mirrored images side by side."""
+    """Puts the map and its rotated and mirrored images side by side: [nodes, lanes]."""
     image = by_node.reshape(*grid.shape, -1)
     return jnp.concatenate([jnp.flip(image, view.flipped) for view in views], axis=-1).reshape(len(by_node), -1)
 
 
 def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
-    """Contact heights of the wheels: [4, A P, lanes]."""
+    """Gathers the contact heights of the wheels: [4, A P, lanes]."""
     heights = by_node.at[wheels].get(mode="promise_in_bounds")
     return heights.reshape(*heights.shape[:2], -1)
 
 
 @dataclass(frozen=True)
 class _Planes:
-    """Pose planes: height = level + east * columns + north * rows, counted from the node `centre`; [A P, lanes] each.
+    """Pose planes: height = level + east * columns + north * rows from the node `centre`; [A P, lanes] each.
 
     pitch, roll, steepness: as in events.Pose
     """
@@ -246,9 +246,10 @@ class _Planes:
 
 
 def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
-    """The least-squares planes through the four contacts.
+    """Fits the least-squares planes to the four contacts.
 
-    Each sum is joined with one product at most, however the loop is compiled: a map has the same bits in any batch.
+    Each sum includes at most one unrounded product, so that a map gives the same bits in any batch, however the loop is
+    compiled.
     """
     front_left, front_right, rear_left, rear_right = contact
     pitch = ((front_left + front_right) - (rear_left + rear_right)) * (0.5 / wheelbase)
@@ -264,7 +265,7 @@ def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: 
 
 
 def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
-    """Largest height of a chassis node above the pose plane: [A P, lanes]."""
+    """Returns the largest height of a chassis node above the pose plane: [A P, lanes]."""
     highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
     if not len(chunk.runs):
         return highest
@@ -273,7 +274,7 @@ def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) 
 
 
 def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
-    """Largest height above the pose plane over the places, of each of the `run` nodes of one: [A P, run * lanes]."""
+    """Returns the largest height above the pose plane over all places, for each of `run` nodes: [A P, run * lanes]."""
     nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
     aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
     level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
@@ -300,10 +301,10 @@ def _arc_maxima(
     maxima = []
     for poses in _arc_poses(contact, plane, clearance, layout):
         values = [reduce(larger, map(event.value, poses)) for event in events]
-        # Place by place along the arc, so that the obstacle event and this share the maximum of the clearances.
+        # Contacts and clearance are each reduced along the arc first: the obstacle event shares the largest clearance.
         ground = zip(*((*pose.contact, pose.clearance) for pose in poses), strict=True)
         highest = reduce(larger, (reduce(larger, heights) for heights in ground))
-        # The barrier keeps XLA from computing the maxima of a first arc anew for each second arc.
+        # The barrier keeps XLA from recomputing the maxima of a first arc for each second arc.
         maxima.append(jax.lax.optimization_barrier(jnp.stack([*values, highest])))
     return larger(*maxima)
 
@@ -311,7 +312,7 @@ def _arc_maxima(
 def _arc_poses(contact: jax.Array, plane: _Planes, clearance: jax.Array, layout: Layout) -> tuple[list[Pose], ...]:
     """Returns the poses along the first arcs, their arrays [A, 1, lanes], and along the second arcs, [A, R, lanes].
 
-    What no event asks for is not computed: XLA leaves out what has no use.
+    XLA does not compute fields that no event uses.
     """
 
     def along(field: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
