@@ -24,14 +24,14 @@ COLOURS = {"safe": "#c9e8f7", "obstacle": "#f0a500", "step": "#c8431b", "tilt": 
 INK, PALE, SHADE = "#222222", "#8a8a8a", "#d9d9d9"
 
 PACKAGES = [
-    {"experiments": "the paper's experiments, and a comparison"},
-    {"commands": "one module a command: parse, call the library, print"},
-    {"training": "the trainer and its step, evaluation on test maps"},
-    {"runs": "a run on disk, predictors", "evaluation": "scores, tables, figures"},
+    {"commands": "parse, call the library, print", "experiments": "the paper's, and a comparison"},
+    {"training": "fitting: the trainer and its step; evaluation on test maps"},
+    {"runs": "a run on disk: checkpoints, model file, predictors"},
+    {"estimators": "presets, samples, losses", "evaluation": "scores, tables, figures"},
     {"data": "windows of real sites, samples, splits, data sets"},
     {"point_clouds": "LAS, LAZ, PLY, PCD, text, meshes"},
     {"terrain": "synthetic ground", "rasters": "GeoTIFF and others", "models": "ResNet50, hazard field"},
-    {"simulation": "grid, robot, actions, margins", "resnet": "network, ImageNet weights"},
+    {"simulation": "grid, robot, actions, events", "resnet": "network, ImageNet weights"},
 ]
 """Packages and what each holds, in rows: each imports only from rows below its own."""
 

@@ -3,7 +3,7 @@
     python examples/train_field.py
 
 It takes a minute or two on two cores: 300 maps are far too few for a good field, and the one that comes with travjax
-is shown beside it. After what the training prints, it prints
+is shown beside it. After what training and evaluation print, it prints
 
     F1 on 20 maps with 3 cm of noise, against the labels of the clean maps
     simulator             0.211
@@ -11,15 +11,13 @@ is shown beside it. After what the training prints, it prints
     field of the package  0.807
 """
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 
 import travjax
 from travjax.data.sensor_noise import noisy
-from travjax.runs.predictor import Predictor
+from travjax.files import find_preset
 
 NOISE = 0.03
 """Metres, standard deviation of the noise at each node."""
@@ -31,10 +29,10 @@ def f1(predicted: np.ndarray, failed: np.ndarray) -> float:
 
 
 def main(preset: str = "smoke", out: str = "runs/examples/field", maps: int = 20) -> None:
-    """Trains a preset of the hazard field into a folder, and prints F1 on maps that it has not seen."""
-    if not Path(out, "run.json").exists():
-        command = [sys.executable, "-m", "travjax", "train", preset, "--model", "field", "--out", out]
-        subprocess.run(command, check=True)
+    """Trains a preset of the hazard field into a folder, evaluates it, and prints F1 on noisy maps."""
+    if not Path(out, "evaluation").exists():
+        travjax.fit(travjax.run_from_preset(find_preset(preset, "field")), out, resume=True)
+        travjax.evaluate_run(out)
     clean = np.asarray(travjax.generate_terrain("rough", range(9000, 9000 + maps)))
     noise = np.random.default_rng(0)
     seen = noisy(clean, NOISE, noise)
@@ -42,7 +40,7 @@ def main(preset: str = "smoke", out: str = "runs/examples/field", maps: int = 20
     print(f"F1 on {maps} maps with {100 * NOISE:.0f} cm of noise, against the labels of the clean maps")
     print(f"simulator             {f1(np.asarray(travjax.label(seen)), failed):.3f}")
     for name, source in (("field, just trained", out), ("field of the package", None)):
-        print(f"{name:<22}{f1(Predictor.load(source).predict(seen).probability >= 0.5, failed):.3f}")
+        print(f"{name:<22}{f1(travjax.Predictor.load(source).predict(seen).probability >= 0.5, failed):.3f}")
 
 
 if __name__ == "__main__":

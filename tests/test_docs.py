@@ -1,6 +1,8 @@
 """The README and the documentation: their Python runs, their links lead somewhere, and the README stays short."""
 
+import ast
 import doctest
+import pkgutil
 import re
 import runpy
 from pathlib import Path
@@ -8,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.test_layering import LAYERS, MODULES, PACKAGE, imports_of
+from tests.test_layering import LAYERS, MODULES, PACKAGE, TOP, imports_of
 
 ROOT = Path(__file__).parents[1]
 MADE = {"_build", "api", "records"}
@@ -22,6 +24,7 @@ README = ROOT / "README.md"
 NOT_RUN = "<!-- not run -->\n"
 BLOCK = re.compile(rf"(?P<left_out>{NOT_RUN})?```python\n(?P<code>.*?)^```$", re.DOTALL | re.MULTILINE)
 MOST_WORDS = 900
+DEFINITIONS = (ast.FunctionDef, ast.ClassDef)
 LARGEST_PICTURE = 300_000
 
 
@@ -39,9 +42,33 @@ def name_of(page: Path) -> str:
 WITH_CODE = [page for page in PAGES if (page == README or "docs" in page.parts) and blocks_of(page)]
 
 
+TINY_PRESET = """
+weights = "none"
+elevation_scale = 0.1
+[dataset]
+maps = 5
+validation = 0.2
+test = 0.2
+[trunk]
+blocks = [1]
+width = 4
+[heads]
+hidden = 4
+[training]
+batch_size = 8
+head_epochs = 0
+epochs = 1
+each = 3
+failing = 2
+[evaluation]
+each = 20
+"""
+
+
 @pytest.fixture
-def site(tmp_path, monkeypatch) -> None:
-    """A working directory with site.tif, 16 x 16 m of gentle ground at 0.0625 m."""
+def folder(tmp_path, monkeypatch) -> None:
+    """A working directory with mine.toml, a tiny preset, and site.tif, 16 x 16 m of gentle ground at 0.0625 m."""
+    (tmp_path / "mine.toml").write_text(TINY_PRESET)
     rasterio = pytest.importorskip("rasterio")
     y, x = np.mgrid[:257, :257] * 0.0625
     heights = (0.3 * np.sin(x) * np.cos(0.7 * y)).astype(np.float32)
@@ -53,7 +80,7 @@ def site(tmp_path, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
-def test_python_of_a_page_runs_and_prints_what_it_says(page, site):
+def test_python_of_a_page_runs_and_prints_what_it_says(page, folder):
     names: dict[str, object] = {"__name__": page.stem}
     runner = doctest.DocTestRunner(verbose=False)
     for line, code in blocks_of(page):
@@ -72,6 +99,29 @@ def test_links_of_a_page_lead_somewhere(page):
     relative = [target.split("#")[0] for target in targets if not target.startswith(("http", "#"))]
     missing = [target for target in relative if not (page.parent / target).exists()]
     assert not missing
+
+
+OURS = re.compile(r"(?<![\w./*-])((?:travjax|tests|docs|experiments|examples)(?:/[\w.-]+)*/[\w.-]*\w|[\w/]+\w\.py)\b")
+NAMES = re.compile(r"\btravjax(?:\.[A-Za-z_]\w*)+")
+NOT_THERE = {
+    *("travjax.corruption", "travjax.dataset.load"),
+    *("travjax/estimators/pooled_estimator.py", "travjax.estimators.pooled_estimator", "travjax/presets/pooled"),
+}
+"""Names of the past, and of what a reader is to write."""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_files_and_modules_that_a_page_names_exist(page):
+    text = page.read_text()
+    places = (ROOT, PACKAGE, page.parent)
+    missing = {
+        name
+        for name in set(OURS.findall(text)) - NOT_THERE
+        if not any((place / name).exists() for place in places) and not ("/" not in name and [*ROOT.rglob(name)])
+    }
+    assert not missing
+    for name in set(NAMES.findall(text)) - NOT_THERE:
+        assert pkgutil.resolve_name(name)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -98,6 +148,13 @@ def test_pictures_of_the_readme_are_small():
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README.read_text())
     assert pictures
     assert all((ROOT / picture).stat().st_size < LARGEST_PICTURE for picture in pictures)
+
+
+def test_the_model_of_the_page_is_the_one_that_is_tested():
+    code = blocks_of(ROOT / "docs/extending/model.md")[1][1]
+    tested = (ROOT / "tests/training/test_own_model.py").read_text()
+    parts = [ast.get_source_segment(code, node) for node in ast.parse(code).body if isinstance(node, DEFINITIONS)]
+    assert len(parts) == 4 and all(part.replace("3042", "len(FEW)") in tested for part in parts)
 
 
 HEADLINES = {
@@ -151,7 +208,7 @@ def test_links_between_pages_of_the_site_lead_to_pages_and_others_to_files():
 def test_packages_of_the_drawing_import_only_from_rows_below():
     rows = runpy.run_path(str(ROOT / "docs/pictures.py"))["PACKAGES"]
     row_of = {name: row for row, names in enumerate(reversed(rows)) for name in names}
-    assert set(row_of) == set(LAYERS) - {"", "program"}
+    assert set(row_of) == set(LAYERS) - {*TOP}
     for module in MODULES:
         package = module.split(".")[0]
         if package in row_of and not module.endswith("__init__"):

@@ -22,7 +22,7 @@ from travjax.simulation.robot import Robot
 PAPER = ActionSpace()
 LEVEL = 1 / 255
 TOLERANCE = LEVEL / 2 + 3e-4
-"""Half a level of uint8, and float32 geometry; SPEC asks for 0.02."""
+"""Half a level of a byte, and float32 geometry (SPEC section 6)."""
 
 STEP = 2.5e-4
 """Metres of path between the points of the float64 rendering; between them paths are taken as straight."""

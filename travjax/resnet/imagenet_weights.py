@@ -3,7 +3,7 @@
 Whatever file they come from (weight_files.py), arrays are float32 afterwards and have one set of names: for each
 convolution `res2a_branch2a/kernel`, `/gamma`, `/beta`, `/mean`, `/var`; for the top layer, if there is one of 1000
 classes, `fc1000/kernel` and `fc1000/bias`. Kernels are [rows, cols, in, out] and take channels in the order R, G, B
-with values (x / 255 - mean) / std, about -2 to 2, a range that the channels of SPEC section 6 share.
+with values (x / 255 - mean) / std, about -2 to 2, a range that the input channels share (SPEC section 8).
 
 The weights of Keras are made for B, G, R with values x - mean (its `preprocess_input` in mode "caffe"), hundreds of
 units wide. Their first kernel is reversed and multiplied by PIXEL_SCALE, so that it does to (x / 255 - mean) / std

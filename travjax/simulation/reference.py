@@ -1,7 +1,7 @@
 """Sequential float64 traverse simulator: the oracle for the batched kernel and the baseline of the benchmarks.
 
-It computes section 5 of the specification (static poses on a height map) for the action space of section 4
-in the frames of section 1, one trajectory and one pose at a time as the simulator of Visca et al. 2021 does.
+It computes SPEC section 5 (static poses on a height map) for the action space of SPEC section 4 in the frames of
+SPEC section 1, one trajectory and one pose at a time as the simulator of Visca et al. 2021 does.
 It is plain NumPy and shares no code with the rest of the package; `robot` and `actions` are any objects with
 the attributes of travjax.Robot and travjax.ActionSpace.
 

@@ -48,7 +48,8 @@ class TerrainParams:
     perc_obstacles, smooth_transition: where the mixing noise (0 to 1) turns from mountains to plains, and how softly
     distribution_x, distribution_y:    0 to 1, how often plains and mountains alternate along x and y
     height_obstacles:                  metres, height of the mountains (negative: craters)
-    smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres, M the map size or the `world`
+    smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres, M the map size or the `world`; the
+                                       style mountain_crater draws smooth_mountains up to 6
     slopes_variation:                  exponent of the plains
     max_slope_variation:               scale of the plains
     """
