@@ -3,7 +3,7 @@
 All NumPy on the host. Maps are [n, rows, cols] metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -18,29 +18,29 @@ Maps = Float[np.ndarray, "n rows cols"]
 class CorruptionConfig:
     """What of the training maps is corrupted, each time anew; their labels stay those of the clean map.
 
-    share:   of the maps; the others are seen as they are
-    noise:   metres, largest standard deviation of the noise; it is uniform from 0
-    missing: largest share of missing nodes, uniform from 0, in half of the corrupted maps
-    coarse:  share of the corrupted maps of which only every second node is seen
+    probability: that a map is corrupted; the others are seen as they are
+    noise:       metres, largest standard deviation of the noise; it is uniform from 0
+    missing:     largest share of missing nodes, uniform from 0, in half of the corrupted maps
+    coarse:      share of the corrupted maps of which only every second node is seen
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
 
-    share: float = 0.0
+    probability: float = field(default=0.0, metadata={"formerly": "share"})
     noise: float = 0.06
     missing: float = 0.25
     coarse: float = 0.2
 
     def __post_init__(self):
         require_number("noise", self.noise, -1e-300, 1, "metres, from 0 to 1")
-        for name, most in (("share", 1), ("missing", 0.9), ("coarse", 1)):
+        for name, most in (("probability", 1), ("missing", 0.9), ("coarse", 1)):
             require_number(name, getattr(self, name), -1e-300, most, f"a share from 0 to {most}")
 
 
 def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) -> Maps:
     """Returns maps as sensors may see them, filled where nodes are missing; float32."""
     result = np.array(maps, np.float32)
-    for index in np.flatnonzero(rng.random(len(maps)) < config.share):
+    for index in np.flatnonzero(rng.random(len(maps)) < config.probability):
         one = result[index : index + 1]
         if rng.random() < config.coarse:
             one = upsampled(one)
