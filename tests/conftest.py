@@ -186,17 +186,17 @@ def shared_code() -> Iterator[None]:
     """Trainers of the same settings of the optimizer share compiled code."""
     from travjax.estimators.preset import TrainingConfig
 
-    make, made = TrainingConfig.optimizer, {}
+    make, made = TrainingConfig.make_optimizer, {}
 
-    def optimizer(config, phase, steps):
+    def make_optimizer(config, phase, steps):
         steps = steps if config.schedule == "cosine" else 1
-        names = ("method", "learning_rate", "decay", "epsilon", "clip", "schedule", "warmup_steps")
-        own = config.weight_decay if config.method == "adamw" else None
+        names = ("optimizer", "learning_rate", "decay", "epsilon", "max_grad_norm", "schedule", "warmup_steps")
+        own = config.weight_decay if config.optimizer == "adamw" else None
         key = (phase, steps, own, *(getattr(config, name) for name in names))
         return made.setdefault(key, make(config, phase, steps))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TrainingConfig, "optimizer", optimizer)
+        patch.setattr(TrainingConfig, "make_optimizer", make_optimizer)
         yield
 
 

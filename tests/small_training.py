@@ -47,13 +47,13 @@ head_epochs = 2
 epochs = 2
 learning_rate = 1e-3
 warmup_steps = 3
-each = 3
-failing = 2
-fresh = true
+trajectories_per_map = 3
+failing_per_map = 2
+resample_each_epoch = true
 checkpoint_steps = 3
 [evaluation]
 maps = 4
-each = 6
+trajectories_per_map = 6
 """
 
 PRESET = Preset(
@@ -69,9 +69,9 @@ PRESET = Preset(
         epochs=2,
         learning_rate=1e-3,
         warmup_steps=3,
-        each=3,
-        failing=2,
-        fresh=True,
+        trajectories_per_map=3,
+        failing_per_map=2,
+        resample_each_epoch=True,
         checkpoint_steps=3,
     ),
     evaluation=EvaluationConfig(4, 6),

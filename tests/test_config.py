@@ -13,6 +13,7 @@ from travjax.config import (
     load_toml,
     one_line,
     parse_json,
+    parts_from_json,
     read_json,
     require,
     require_number,
@@ -354,3 +355,84 @@ def test_the_table_of_a_list_that_is_wrong_is_numbered(ramp_file, text, message)
 def test_json_that_does_not_fit_is_refused(table, message):
     with pytest.raises(InputError, match=f"^{message}$"):
         from_json(table, Ramp)
+
+
+# ---- Keys that were renamed
+
+
+@dataclass(frozen=True)
+class Slide:
+    drop: float = field(default=1.0, metadata={"formerly": "fall"})
+    slope: float = field(default=0.5, metadata={"angle": True, "formerly": "incline"})
+
+
+@dataclass(frozen=True)
+class Playground:
+    slide: Slide = Slide()
+    slides: tuple[Slide, ...] = field(default=(), metadata={"items": Slide})
+
+
+def notice(where, old: str, new: str) -> str:
+    return f"{where}: key {old!r} is now called {new!r}; the old name will not be read by the next version\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new"),
+    [
+        ("[slide]\nfall = 2", "fall", "drop"),
+        ("[slide]\nincline = 0.25", "incline", "slope"),
+        ("[slide]\nincline_deg = 30", "incline_deg", "slope_deg"),
+        ("[[slides]]\nfall = 2\n[[slides]]\nfall = 3", "fall", "drop"),
+    ],
+)
+def test_an_old_key_is_read_and_said_once(ramp_file, capsys, text, old, new):
+    now = load_toml(ramp_file(text.replace(old, new)), Playground)
+    assert capsys.readouterr().out == "" and now != Playground()
+    path = ramp_file(text)
+    assert load_toml(path, Playground) == now
+    assert capsys.readouterr().out == notice(path, old, new)
+
+
+def test_several_old_keys_are_one_notice(ramp_file, capsys):
+    path = ramp_file("[slide]\nfall = 2\nincline_deg = 30")
+    assert load_toml(path, Playground) == Playground(Slide(2, math.radians(30)))
+    assert capsys.readouterr().out == (
+        f"{path}: keys 'fall', 'incline_deg' are now called 'drop', 'slope_deg'; "
+        "the old names will not be read by the next version\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "old", "new"),
+    [
+        ("fall = 2\ndrop = 2", "fall = 2", "drop"),
+        ("drop = 2\nfall = 2", "fall = 2", "drop"),
+        ("incline_deg = 3\nslope_deg = 3", "incline_deg = 3", "slope_deg"),
+    ],
+)
+def test_an_old_key_beside_the_new_one_is_refused(ramp_file, capsys, text, old, new):
+    path = ramp_file(text)
+    with pytest.raises(InputError) as raised:
+        load_toml(path, Slide)
+    assert str(raised.value) == f"{path}: {old}: must be left out beside {new}, its name now"
+    assert capsys.readouterr().out == ""
+
+
+def test_an_old_key_in_one_unit_beside_the_new_one_in_another_is_refused(ramp_file):
+    for text in ("incline_deg = 3\nslope = 0.1", "slope_deg = 3\nincline = 0.1"):
+        with pytest.raises(InputError, match="is given twice"):
+            load_toml(ramp_file(text), Slide)
+
+
+def test_old_keys_are_read_from_json_and_not_written(capsys):
+    assert to_json(Slide(2, 0.25)) == {"drop": 2, "slope": 0.25}
+    assert from_json({"fall": 2, "incline": 0.25}, Slide, "run.json") == Slide(2, 0.25)
+    assert capsys.readouterr().out.startswith("run.json: keys 'fall', 'incline' are now called 'drop', 'slope'; ")
+    parts = parts_from_json({"one": {"fall": 2}, "two": {"fall": 3}}, {"one": Slide, "two": Slide}, "run.json")
+    assert parts == {"one": Slide(2), "two": Slide(3)}
+    assert capsys.readouterr().out == notice("run.json", "fall", "drop")
+
+
+def test_an_old_key_is_not_among_those_allowed(ramp_file):
+    with pytest.raises(InputError, match="unknown key 'fell'; allowed: drop, slope, slope_deg"):
+        load_toml(ramp_file("fell = 2"), Slide)

@@ -101,7 +101,7 @@ def test_a_run_is_read_or_refused_in_one_line():
 def test_what_came_of_an_epoch_is_read_or_refused_in_one_line():
     counts = {"confusion": {"tn": 1, "fp": 2, "fn": 3, "tp": 4, "f1": 0.5}}
     sites = {"quarry": dict.fromkeys(("step", "obstacle", "tilt", "overall"), counts)}
-    row = {"step": 1, "epoch": 1, "watched": sites, "average_precision": {"overall": 0.5}}
+    row = {"step": 1, "epoch": 1, "eval_sets": sites, "average_precision": {"overall": 0.5}}
     outcomes = [refused(Epoch.from_row, other) for other in altered(row)]
     assert 0.4 < sum(outcomes) / len(outcomes) < 1
 

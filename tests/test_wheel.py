@@ -30,12 +30,12 @@ widths = [4]
 channels = 3
 hidden = 4
 [training]
-method = "adamw"
+optimizer = "adamw"
 batch_size = 4
 head_epochs = 0
 epochs = 1
-each = 3
-failing = 0
+trajectories_per_map = 3
+failing_per_map = 0
 """
 """A preset of the hazard field that trains in seconds."""
 

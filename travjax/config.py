@@ -3,7 +3,8 @@
 A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
 may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is. A field with the
 metadata `items` is a tuple of configurations of that kind, in the file a list of tables, `[[field]]`. One with the
-metadata `optional` is left out of JSON while it is None.
+metadata `optional` is left out of JSON while it is None. One with the metadata `formerly` is read by that older name as
+well, and a line says so.
 """
 
 import dataclasses
@@ -21,6 +22,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 Config = TypeVar("Config")
+
+Renamed = dict[str, str]
+"""Old keys that were read, and what they are called now."""
 
 LONGEST = 600
 """Characters of a message, and of a name that is printed; the middle of a longer one is left out."""
@@ -100,10 +104,22 @@ def load_toml(path: str | Path, kind: type[Config]) -> Config:
     """
     path = Path(os.path.expanduser(path))
     table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
+    older: Renamed = {}
     try:
-        return _made(table, kind)
+        made = _made(table, kind, older)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    say_renamed(path, older)
+    return made
+
+
+def say_renamed(where: object, older: Mapping[str, str]) -> None:
+    """Prints a line that begins with `where` if there are old keys; older: what each of them is called now."""
+    if older:
+        one = len(older) == 1
+        old, new = (", ".join(map(repr, names)) for names in (older, older.values()))
+        keys, names = (f"key {old} is", "name") if one else (f"keys {old} are", "names")
+        print(one_line(f"{where}: {keys} now called {new}; the old {names} will not be read by the next version"))
 
 
 def read_json(path: Path, allowed: str = "", finite: bool = True) -> Any:
@@ -198,29 +214,43 @@ def to_json(config: object) -> dict[str, Any]:
     return {field.name: plain(value) for field, value in values.items() if field not in left_out}
 
 
-def from_json(table: Any, kind: type[Config]) -> Config:
-    """Restores the configuration that `to_json` was given; raises InputError for unknown or missing keys and bad
-    values.
+def from_json(table: Any, kind: type[Config], where: object = "saved settings") -> Config:
+    """Restores the configuration that `to_json` was given, and prints which keys are old; where: the file.
+
+    Raises InputError for unknown or missing keys and bad values.
     """
+    older: Renamed = {}
+    made = _restored(table, kind, older)
+    say_renamed(where, older)
+    return made
+
+
+def _restored(table: Any, kind: type[Config], older: Renamed) -> Config:
     require(isinstance(table, dict), kind.__name__, table, "a table")
     infinite = {"inf": math.inf, "-inf": -math.inf}
     number = lambda item: infinite.get(item, item) if isinstance(item, str) else item
     lists = {key: [number(item) for item in value] for key, value in table.items() if type(value) is list}
-    return kind(**_fields_from(table | lists, kind))  # tables within a table hold no infinite numbers
+    return kind(**_fields_from(table | lists, kind, older))  # tables within a table hold no infinite numbers
 
 
-def parts_from_json(table: Any, kinds: Mapping[str, type]) -> dict[str, Any]:
-    """Returns the configurations that a table has under names; raises InputError that says what is missing or wrong."""
+def parts_from_json(table: Any, kinds: Mapping[str, type], where: object = "saved settings") -> dict[str, Any]:
+    """Returns the configurations that a table has under names, and prints which keys are old; where: the file.
+
+    Raises InputError that says what is missing or wrong.
+    """
     missing = [name for name in kinds if not isinstance(table, dict) or name not in table]
     if missing:
         raise InputError(f"missing {', '.join(missing)}")
-    return {name: from_json(table[name], kind) for name, kind in kinds.items()}
+    older: Renamed = {}
+    parts: dict[str, Any] = {name: _restored(table[name], kind, older) for name, kind in kinds.items()}
+    say_renamed(where, older)
+    return parts
 
 
-def _made(table: dict, kind: type[Config]) -> Config:
+def _made(table: dict, kind: type[Config], older: Renamed) -> Config:
     """Makes the configuration of a table; errors name and show an angle that was given in degrees as it was given."""
     try:
-        return kind(**_fields_from(table, kind))
+        return kind(**_fields_from(table, kind, older))
     except InputError as error:
         message = str(error)
         for key, value in table.items():
@@ -230,12 +260,18 @@ def _made(table: dict, kind: type[Config]) -> Config:
         raise InputError(message) from None
 
 
-def _fields_from(table: dict, kind: type) -> dict:
+def _fields_from(table: dict, kind: type, older: Renamed) -> dict:
+    """Returns the values of a table by field; `older` takes in its old keys."""
     names = {field.name: field for field in dataclasses.fields(kind)}
+    former = {field.metadata["formerly"]: name for name, field in names.items() if "formerly" in field.metadata}
     values = {}
     for key, value in table.items():
         name = key.removesuffix("_deg")
         degrees = key != name
+        if name in former and name not in names:
+            name = former[name]
+            older[key] = f"{name}_deg" if degrees else name
+            require(older[key] not in table, key, value, f"left out beside {older[key]}, its name now")
         if name not in names or degrees and not names[name].metadata.get("angle"):
             raise InputError(_unknown(key, names))
         if name in values:
@@ -244,11 +280,12 @@ def _fields_from(table: dict, kind: type) -> dict:
             require_number(key, value, -math.inf, math.inf, "a number of degrees")
             value = math.radians(value)
         if dataclasses.is_dataclass(names[name].default):
-            value = _inner(key, value, type(names[name].default), f"[{key}]", f"[{key}]")
+            value = _inner(key, value, type(names[name].default), f"[{key}]", f"[{key}]", older)
         elif "items" in names[name].metadata:
             inner, written = names[name].metadata["items"], f"[[{key}]]"
             require(isinstance(value, list), key, value, f"a list of tables {written}")
-            value = [_inner(key, item, inner, written, f"{key} {number}:") for number, item in enumerate(value, 1)]
+            numbered = enumerate(value, 1)
+            value = [_inner(key, item, inner, written, f"{key} {number}:", older) for number, item in numbered]
         values[name] = tuple(value) if isinstance(value, list) else value
     missing = [n for n, f in names.items() if n not in values and f.default is dataclasses.MISSING]
     if missing:
@@ -267,10 +304,10 @@ def _unknown(key: str, names: dict[str, dataclasses.Field]) -> str:
     return f"unknown key {shown(key)}; allowed: {', '.join(allowed)}{meant}"
 
 
-def _inner(key: str, table: object, kind: type, written: str, place: str) -> object:
+def _inner(key: str, table: object, kind: type, written: str, place: str, older: Renamed) -> object:
     """Makes the configuration of a table within a table; `place` names it in errors."""
     require(isinstance(table, dict), key, table, f"a table {written}")
     try:
-        return _made(table, kind)  # type: ignore[arg-type]
+        return _made(table, kind, older)  # type: ignore[arg-type]
     except InputError as error:
         raise InputError(f"{place} {error}") from None

@@ -78,7 +78,14 @@ def test_without_a_share_maps_stay_as_they_are():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("share", 1.5), ("share", -0.1), ("noise", -1), ("missing", 0.95), ("coarse", 2), ("share", "x")],
+    [
+        ("probability", 1.5),
+        ("probability", -0.1),
+        ("noise", -1),
+        ("missing", 0.95),
+        ("coarse", 2),
+        ("probability", "x"),
+    ],
 )
 def test_what_cannot_be_is_refused(name, value):
     with pytest.raises(InputError, match=f"{name} = "):

@@ -74,7 +74,7 @@ def test_the_kernels_of_the_heads_decay_under_rmsprop(tmp_path):
     """With a learning rate of each number's own, a strong decay alone drives them towards zero."""
     size = {}
     for decay in (0.0, 10.0):
-        made = begun(tmp_path / f"{decay}", method="rmsprop", weight_decay=decay, epochs=1)
+        made = begun(tmp_path / f"{decay}", optimizer="rmsprop", weight_decay=decay, epochs=1)
         made.train()
         heads = saved_state(tmp_path / f"{decay}")
         size[decay] = sum((heads[f"heads/heads/{layer}/kernel"] ** 2).sum() for layer in ("first", "second", "hazard"))

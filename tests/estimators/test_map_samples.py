@@ -145,7 +145,7 @@ def test_a_step_is_the_same_each_time_and_unlike_another_step_or_seed():
 def test_the_arcs_of_a_step_are_different_and_as_many_as_the_setting_says():
     maps = dataset().maps_of("train")[:1]
     for each, count in ((1, 1), (3, 1), (7, 2), (9, 3), (999, 6)):
-        trajectories = shown(data_of(each=each, failing=0).prepared(maps, 0))[1]
+        trajectories = shown(data_of(trajectories_per_map=each, failing_per_map=0).prepared(maps, 0))[1]
         assert len(np.unique(trajectories)) == len(trajectories) == 3 * count
 
 
@@ -158,7 +158,10 @@ def test_preparing_a_step_leaves_the_data_set_alone():
 def test_trajectories_on_unknown_ground_are_no_targets():
     heights = dataset().heights.copy()
     heights[:, 24:28, 10:20] = np.nan
-    data, maps = data_of(data=replace(dataset(), heights=heights), each=999), dataset().maps_of("train")[:3]
+    data, maps = (
+        data_of(data=replace(dataset(), heights=heights), trajectories_per_map=999),
+        dataset().maps_of("train")[:3],
+    )
     positions = np.stack(images_of(heights[maps[0]]))
     masks, share = np.asarray(simulate(positions, HUSKY, FEW, grid=GRID).known), []
     for step in STEPS:

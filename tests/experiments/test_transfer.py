@@ -41,7 +41,7 @@ PRESET = """
 sites = "sites.toml"
 synthetic = "tiny.toml"
 seeds = [0, 1]
-each = 5
+trajectories_per_map = 5
 shown = "crater"
 shown_maps = 1
 [training]
@@ -49,8 +49,8 @@ batch_size = 8
 head_epochs = 2
 epochs = 0
 learning_rate = 1e-3
-each = 3
-failing = 2
+trajectories_per_map = 3
+failing_per_map = 2
 """
 
 
@@ -179,7 +179,7 @@ def refused(*words) -> str:
 
 def test_a_folder_of_another_preset_is_refused(whole, preset, tmp_path):
     other = write_files(tmp_path)
-    other.write_text(PRESET.replace("each = 5", "each = 6"))
+    other.write_text(PRESET.replace("trajectories_per_map = 5", "trajectories_per_map = 6"))
     before = (whole[1] / "results.json").read_text()
     assert "another preset" in refused(other, "--out", whole[1])
     assert (whole[1] / "results.json").read_text() == before
@@ -192,7 +192,18 @@ def test_an_experiment_goes_on_when_the_files_that_its_preset_names_have_moved(t
     transfer._require_same(tmp_path, moved)
     assert loads((tmp_path / "config.json").read_text()) == loads(json.dumps(to_json(moved)))
     with pytest.raises(InputError, match="another preset"):
-        transfer._require_same(tmp_path, replace(moved, each=7))
+        transfer._require_same(tmp_path, replace(moved, trajectories_per_map=7))
+
+
+def test_an_experiment_of_old_keys_goes_on_with_a_notice(tmp_path, capsys):
+    begun, path = TransferConfig(training=TrainingConfig(head_epochs=0)), tmp_path / "config.json"
+    text = json.dumps(to_json(begun))
+    path.write_text(text.replace('"trajectories_per_map"', '"each"'))
+    transfer._require_same(tmp_path, begun)
+    assert capsys.readouterr().out == (
+        f"{path}: key 'each' is now called 'trajectories_per_map'; the old name will not be read by the next version\n"
+    )
+    assert loads(path.read_text()) == loads(text)
 
 
 def test_a_data_set_for_another_robot_is_refused_with_both_named(preset, trained, tmp_path):

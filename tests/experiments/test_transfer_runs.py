@@ -36,9 +36,11 @@ pytestmark = pytest.mark.usefixtures("shared_code")
 SITES = np.array(["hill", "plain", "dune"])
 FROZEN = TransferConfig(
     seeds=(0, 1),
-    each=5,
+    trajectories_per_map=5,
     shown="hill",
-    training=TrainingConfig(batch_size=8, head_epochs=2, epochs=0, learning_rate=1e-3, each=3, failing=2),
+    training=TrainingConfig(
+        batch_size=8, head_epochs=2, epochs=0, learning_rate=1e-3, trajectories_per_map=3, failing_per_map=2
+    ),
 )
 WHOLE = replace(FROZEN, seeds=(3,), training=replace(FROZEN.training, head_epochs=0, epochs=1))
 
@@ -74,7 +76,7 @@ def test_every_run_has_a_row_for_its_first_state_and_each_epoch(frozen):
         assert list(seeds) == [0, 1]
         for run in seeds.values():
             assert [row["epoch"] for row in run] == [0, 1, 2]
-            assert all(set(row["watched"]) == set(made.held_out) for row in run)
+            assert all(set(row["eval_sets"]) == set(made.held_out) for row in run)
 
 
 def test_the_held_out_samples_are_natural_ones_of_the_test_maps_of_each_site(real, frozen):
@@ -89,7 +91,7 @@ def test_the_held_out_samples_are_natural_ones_of_the_test_maps_of_each_site(rea
 
 
 def test_zero_stands_for_all_trajectories_of_the_held_out_windows(trained, real, tmp_path):
-    made = Transfer(replace(FROZEN, each=0), Run.load(trained), trained, real, tmp_path, Devices.all())
+    made = Transfer(replace(FROZEN, trajectories_per_map=0), Run.load(trained), trained, real, tmp_path, Devices.all())
     test = real.maps_of("test")
     for site, samples in made.held_out.items():
         wanted = every_sample(real.labels, test[real.group[test] == site])
@@ -133,7 +135,7 @@ def test_the_first_state_of_the_synthetic_arm_is_the_untouched_synthetic_model(f
     for site, samples in made.held_out.items():
         counts = metrics.confusions(evaluator.probabilities(made.pretrained, samples), evaluator.failed(samples))
         for seed in FROZEN.seeds:
-            first = rows[SYNTHETIC][seed][0]["watched"][site]
+            first = rows[SYNTHETIC][seed][0]["eval_sets"][site]
             assert {name: scores["confusion"] for name, scores in first.items()} == metrics.json_ready(counts)
 
 
@@ -169,7 +171,7 @@ def test_features_of_another_data_set_are_computed_anew(frozen, trained, real, t
     place.parent.mkdir()
     np.savez(place, dataset="another", training=np.zeros(3))
     made = Transfer(FROZEN, Run.load(trained), trained, real, tmp_path, frozen[0].devices)
-    assert made.rows(IMAGENET, 0)[-1]["watched"] == frozen[1][IMAGENET][0][-1]["watched"]
+    assert made.rows(IMAGENET, 0)[-1]["eval_sets"] == frozen[1][IMAGENET][0][-1]["eval_sets"]
     with np.load(place) as file:
         assert str(file["dataset"]) == real.fingerprint
 
@@ -194,7 +196,7 @@ def test_scores_of_a_finished_run_that_are_damaged_are_one_line(frozen, trained,
     shutil.copytree(made.folder, copied)
     again = Transfer(FROZEN, Run.load(trained), trained, real, copied, made.devices)
     path = again.place_of(SCRATCH, 0) / "metrics.jsonl"
-    scored = [line for line in path.read_text().splitlines() if "watched" in line]
+    scored = [line for line in path.read_text().splitlines() if "eval_sets" in line]
     for lines in (scored[:-1], [scored[0], scored[0], *scored[2:]], [*scored[:-1], scored[-1].replace("hill", "hell")]):
         path.write_text("".join(f"{line}\n" for line in lines))
         with pytest.raises(InputError, match=r"metrics.jsonl: epochs = \[.*: must be 0 to 2, each with scores of "):
@@ -222,7 +224,7 @@ def test_the_estimator_of_an_arm_is_that_of_the_epoch_that_is_best_on_validation
     counts = metrics.confusions(
         evaluator.probabilities(made.estimator(SYNTHETIC, 1), samples), evaluator.failed(samples)
     )
-    assert best["watched"][site]["overall"]["confusion"] == metrics.json_ready(counts["overall"])
+    assert best["eval_sets"][site]["overall"]["confusion"] == metrics.json_ready(counts["overall"])
 
 
 # ---- Bad input
@@ -257,7 +259,7 @@ def test_a_site_to_show_that_is_not_held_out_is_refused_with_those_that_are(trai
         ({"seeds": ()}, "seeds"),
         ({"seeds": (1, 1)}, "seeds"),
         ({"seeds": (-1,)}, "seeds"),
-        ({"each": -1}, "each"),
+        ({"trajectories_per_map": -1}, "trajectories_per_map"),
         ({"shown_maps": math.nan}, "shown_maps"),
         ({"sites": 3}, "sites"),
         ({"training": TrainingConfig(head_epochs=1, epochs=1)}, "[training] head_epochs"),
@@ -284,7 +286,7 @@ def test_figures_of_another_data_set_or_model_are_not_taken_for_ones_of_this(fro
 def test_the_hazard_field_begins_with_random_weights_and_with_the_synthetic_model(real, tmp_path):
     begun(tmp_path / "synthetic").train()
     training = replace(field_runs.PRESET.training, epochs=1)
-    config = replace(FROZEN, seeds=(0,), each=0, training=training)
+    config = replace(FROZEN, seeds=(0,), trajectories_per_map=0, training=training)
     base = Run.load(tmp_path / "synthetic")
     made = Transfer(config, base, tmp_path / "synthetic", real, tmp_path / "out", Devices.all())
     rows = run_all(made, lambda arm, seed: None)
@@ -293,7 +295,7 @@ def test_the_hazard_field_begins_with_random_weights_and_with_the_synthetic_mode
     evaluator = Evaluator.from_run(base, real, Devices.all())
     for site, samples in made.held_out.items():
         found = metrics.evaluate(evaluator.probabilities(made.pretrained, samples), evaluator.failed(samples))
-        counts = rows["synthetic"][0][0]["watched"][site]["overall"]["confusion"]
+        counts = rows["synthetic"][0][0]["eval_sets"][site]["overall"]["confusion"]
         assert counts["tp"] == found.scores["overall"].confusion.tp
     first = [saved_state(made.place_of(arm, 0)) for arm in FIELD_ARMS]
     assert differing(*first)

@@ -31,7 +31,7 @@ def row(epoch: int, validation: float | None, **sites: Confusion) -> dict:
         scored[site] = {
             name: {"confusion": json_ready(one), "average_precision": None} for name, one in confusions.items()
         }
-    made = {"epoch": epoch, "watched": scored}
+    made = {"epoch": epoch, "eval_sets": scored}
     return made if epoch == 0 else made | {"average_precision": {"overall": validation}}
 
 

@@ -162,7 +162,7 @@ def test_the_baseline_takes_no_more_training_samples_than_it_should(evaluator, m
     monkeypatch.setattr("travjax.runs.evaluator.slope_and_step", counted)
     monkeypatch.setattr("travjax.runs.evaluator.REGRESSION_SAMPLES", 15)
     evaluator.regression(evaluator.samples(0, 0))
-    assert taken[0] == 15 // PRESET.training.each
+    assert taken[0] == 15 // PRESET.training.trajectories_per_map
 
 
 # ---- Scores

@@ -244,6 +244,22 @@ def test_what_was_not_written_by_travjax_is_refused(file):
     assert refusal(file).startswith("holds no estimator of travjax")
 
 
-def test_the_estimator_that_comes_with_the_package_has_checksums():
+def test_a_file_of_old_keys_is_read_with_one_notice(file, capsys):
+    text = json.dumps({"run": RUN.to_json(), "notes": NOTES})
+    for new, old in (("trajectories_per_map", "each"), ("optimizer", "method"), ("probability", "share")):
+        text = text.replace(f'"{new}": ', f'"{old}": ')
+    write_safetensors(file, load_file(file), json.loads(text))
+    run, network, notes = read_model(file)
+    assert (run, notes) == (RUN, NOTES)
+    require_equal(host(split_model(network)[1]), host(split_model(estimator())[1]))
+    assert capsys.readouterr().out == (
+        f"{file}: keys 'share', 'method', 'each' are now called 'probability', 'optimizer', 'trajectories_per_map'; "
+        "the old names will not be read by the next version\n"
+    )
+
+
+def test_the_estimator_that_comes_with_the_package_has_checksums_and_no_old_keys(capsys):
     with open_arrays(WEIGHTS / f"{DEFAULT}.safetensors") as shipped:
         assert shipped.checked
+    read_model(WEIGHTS / f"{DEFAULT}.safetensors")
+    assert capsys.readouterr().out == ""

@@ -15,7 +15,7 @@ from travjax.estimators.preset import EvaluationConfig
 from travjax.models.trajectory_resnet import create
 from travjax.models.variables import split_model
 from travjax.runs.checkpoint import Checkpoints
-from travjax.runs.run import Run, load_estimator
+from travjax.runs.run import Run, checked_meta, load_estimator
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -73,6 +73,41 @@ def test_a_setting_that_was_altered_is_named(tmp_path, place, value, message):
     assert refusal(Run.load, tmp_path).startswith(f"{path}: {message}")
 
 
+# ---- Old keys
+
+
+def aged(table: dict) -> dict:
+    """What an older travjax wrote of a run."""
+    text = json.dumps(table)
+    for new, old in (("trajectories_per_map", "each"), ("max_grad_norm", "clip"), ("probability", "share")):
+        assert f'"{new}": ' in text
+        text = text.replace(f'"{new}": ', f'"{old}": ')
+    return json.loads(text)
+
+
+NOTICE = (
+    "keys 'share', 'clip', 'each' are now called 'probability', 'max_grad_norm', 'trajectories_per_map'; "
+    "the old names will not be read by the next version\n"
+)
+
+
+def test_a_run_of_old_keys_is_read_with_one_notice(tmp_path, capsys):
+    path = run_of().save(tmp_path)
+    path.write_text(json.dumps(aged(json.loads(path.read_text()))))
+    assert Run.load(tmp_path) == run_of()
+    assert capsys.readouterr().out == f"{path}: {NOTICE}"
+    Run.load(tmp_path).save(tmp_path)
+    capsys.readouterr()
+    assert Run.load(tmp_path) == run_of() and capsys.readouterr().out == ""
+
+
+def test_a_checkpoint_that_was_trained_with_old_keys_is_one_of_the_run(tmp_path, capsys):
+    position = {"phase": 1, "epoch": 0, "step": 2, "total": 2, "loss": 0.5, "samples": 3.0, "best": -1.0}
+    meta = {"position": position, "optimizer": 1, "dataset": "0123", "run": aged(run_of().to_json())}
+    assert checked_meta(meta, tmp_path, run_of()) == meta
+    assert capsys.readouterr().out == f"{tmp_path}: meta of a checkpoint: {NOTICE}"
+
+
 # ---- Another run
 
 
@@ -108,7 +143,7 @@ def test_the_template_has_the_shapes_of_the_state(phase):
     state = split_model(create(PRESET.trunk, PRESET.heads))[1]
     if phase:
         trained = {name: state[name] for name in run.kind.phases[phase].trained}
-        state = state | {"optimizer": PRESET.training.optimizer(phase, 9).init(trained)}
+        state = state | {"optimizer": PRESET.training.make_optimizer(phase, 9).init(trained)}
     sharding = Devices.all().everywhere
     template = run.template(phase, sharding)
     assert jax.tree.structure(template) == jax.tree.structure(state)

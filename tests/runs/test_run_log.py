@@ -151,3 +151,22 @@ def test_what_lies_in_the_way_is_one_line(tmp_path, name):
     with pytest.raises(InputError, match=f"{name}: cannot be written: ") as raised:
         RunLog(tmp_path)
     assert "\n" not in str(raised.value)
+
+
+def test_an_old_key_of_a_row_is_taken_for_the_new_one_and_said_once(tmp_path, capsys):
+    path, new = tmp_path / "metrics.jsonl", [row | {"eval_sets": {"hill": {}}} for row in ROWS]
+    path.write_text("".join(json.dumps(row).replace("eval_sets", "watched") + "\n" for row in new))
+    assert read_rows(path) == new
+    assert capsys.readouterr().out == (
+        f"{path}: key 'watched' is now called 'eval_sets'; the old name will not be read by the next version\n"
+    )
+    RunLog(tmp_path, step=3).close()
+    capsys.readouterr()
+    assert read_rows(path) == new and capsys.readouterr().out == ""  # a run that goes on writes the new key
+
+
+def test_a_row_with_an_old_key_and_its_new_one_is_left_out(tmp_path, capsys):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text(f"{json.dumps(ROWS[0])}\n{json.dumps(ROWS[1] | {'watched': {}, 'eval_sets': {}})}\n")
+    assert read_rows(path) == ROWS[:1]
+    assert "line 2 left out" in capsys.readouterr().out

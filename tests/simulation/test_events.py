@@ -38,9 +38,9 @@ hidden = 8
 batch_size = 9
 head_epochs = 0
 epochs = 1
-each = 6
+trajectories_per_map = 6
 validation_samples = 40
-method = "adamw"
+optimizer = "adamw"
 """
 RESNET_TOML = "[trunk]" + TOML.partition("[trunk]")[2].replace("batch_size = 8", "batch_size = 32")
 

@@ -80,7 +80,7 @@ def entry():
 
 @pytest.fixture(scope="module")
 def run(entry) -> Run:
-    training = replace(PRESET.training, head_epochs=0, epochs=6, learning_rate=0.05, fresh=False)
+    training = replace(PRESET.training, head_epochs=0, epochs=6, learning_rate=0.05, resample_each_epoch=False)
     return Run(replace(PRESET, model="pooled", training=training), HUSKY, FEW, GRID)
 
 

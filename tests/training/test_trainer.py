@@ -137,7 +137,7 @@ def test_steps_of_the_heads_are_those_of_numpy():
 
 
 def test_rmsprop_adds_epsilon_outside_of_the_root():
-    optimizer = PRESET.training.optimizer(1, 1)
+    optimizer = PRESET.training.make_optimizer(1, 1)
     gradient = {"x": np.array([1e-7, 1e-3, -2.0], np.float32)}
     state = optimizer.init(gradient)
     moved, state = optimizer.update(gradient, state)
@@ -149,7 +149,7 @@ def test_rmsprop_adds_epsilon_outside_of_the_root():
 
 def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
     samples = tuple(index[:8] for index in trainer_samples())
-    made, optimizer = estimator(2), PRESET.training.optimizer(2, 1)
+    made, optimizer = estimator(2), PRESET.training.make_optimizer(2, 1)
     settings = StepSettings(split_model(made)[0], PHASES[2], optimizer, PRESET.training.weight_decay)
     weight = np.array([1, 1, 1, 1, 1, 1, 0, 0], np.float32)
     batch = Batch((source(), *samples), failed_of(samples).astype(np.float32), weight)
@@ -240,7 +240,7 @@ def test_features_of_another_run_of_the_same_trunk_may_be_given(tmp_path, monkey
 # ---- Watched samples
 
 
-def watched() -> dict[str, tuple]:
+def eval_sets() -> dict[str, tuple]:
     """All trajectories of two test maps, and of one."""
     test = dataset().maps_of("test")
     return {"two": every_sample(dataset().labels, test[:2]), "one": every_sample(dataset().labels, test[2:3])}
@@ -248,32 +248,32 @@ def watched() -> dict[str, tuple]:
 
 @pytest.mark.parametrize("phases", [{"head_epochs": 2, "epochs": 0}, {"head_epochs": 0, "epochs": 2}])
 def test_watched_samples_are_scored_before_training_and_after_each_epoch(tmp_path, phases):
-    made = Trainer(run_of(**phases), dataset(), tmp_path, Devices.all(), quiet=True, watched=watched())
+    made = Trainer(run_of(**phases), dataset(), tmp_path, Devices.all(), quiet=True, eval_sets=eval_sets())
     made.start(create(PRESET.trunk, PRESET.heads, 0))
     states = [host(made._variables)]
     made._train_epoch, train = lambda: (train(), states.append(host(made._variables))), made._train_epoch
     made.train()
-    rows = [row for row in rows_of(tmp_path) if "watched" in row]
+    rows = [row for row in rows_of(tmp_path) if "eval_sets" in row]
     assert [row["epoch"] for row in rows] == [0, 1, 2]
     assert rows[0]["step"] == 0
     graph = made.graph
     for row, state in zip(rows, states, strict=True):
-        for name, samples in watched().items():
+        for name, samples in eval_sets().items():
             variables = jax.tree.unflatten(jax.tree.structure(made._variables), list(state.values()))
             probability = probabilities(np.asarray(forward(graph, variables, images_of(samples))))
             wanted = metrics.confusions(probability, made.data.failed(samples).astype(bool))
             for event, counts in wanted.items():
-                assert row["watched"][name][event]["confusion"] == metrics.json_ready(counts)
+                assert row["eval_sets"][name][event]["confusion"] == metrics.json_ready(counts)
 
 
 def test_training_does_not_depend_on_watched_samples(tmp_path):
     begun(tmp_path / "without").train()
-    made = Trainer(run_of(), dataset(), tmp_path / "with", Devices.all(), quiet=True, watched=watched())
+    made = Trainer(run_of(), dataset(), tmp_path / "with", Devices.all(), quiet=True, eval_sets=eval_sets())
     (tmp_path / "with").mkdir()
     made.start(create(PRESET.trunk, PRESET.heads, made.config.seed))
     made.train()
     require_equal(saved_state(tmp_path / "without"), saved_state(tmp_path / "with"))
-    rows = [{name: value for name, value in row.items() if name != "watched"} for row in rows_of(tmp_path / "with")]
+    rows = [{name: value for name, value in row.items() if name != "eval_sets"} for row in rows_of(tmp_path / "with")]
     assert rows[1:] == rows_of(tmp_path / "without")
 
 
@@ -281,19 +281,19 @@ def test_training_does_not_depend_on_watched_samples(tmp_path):
 
 
 def test_runs_of_other_seeds_train_on_the_same_samples_where_a_seed_of_the_subset_is_given(tmp_path):
-    datas = [trainer(tmp_path, seed=seed, subset_seed=7, fresh=False).data for seed in (0, 1)]
+    datas = [trainer(tmp_path, seed=seed, subset_seed=7, resample_each_epoch=False).data for seed in (0, 1)]
     drawn = [[data.samples(1, 0), data.samples(2, 1), data.validation] for data in datas]
     for one, other in zip(*drawn, strict=True):
         np.testing.assert_array_equal(one, other)
     orders = [np.concatenate([places for places, _, _ in data.batches(1, 0)]) for data in datas]
     assert not np.array_equal(*orders)
-    alone = trainer(tmp_path, seed=7, fresh=False).data
+    alone = trainer(tmp_path, seed=7, resample_each_epoch=False).data
     np.testing.assert_array_equal(alone.samples(1, 0), datas[0].samples(1, 0))
     np.testing.assert_array_equal(alone.validation, datas[0].validation)
 
 
 def test_fresh_samples_are_others_in_each_epoch_of_the_second_phase(tmp_path):
-    fresh, fixed = trainer(tmp_path), trainer(tmp_path, fresh=False)
+    fresh, fixed = trainer(tmp_path), trainer(tmp_path, resample_each_epoch=False)
     same = lambda one, other: all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
     assert same(fresh.data.samples(1, 0), fresh.data.samples(1, 1))
     drawn = [fresh.data.samples(1, 0), fresh.data.samples(2, 0), fresh.data.samples(2, 1)]
@@ -319,7 +319,7 @@ def test_the_subset_of_an_epoch_is_drawn_once(tmp_path, monkeypatch):
 
 
 def test_an_epoch_takes_each_sample_once_and_in_another_order_each_time(tmp_path):
-    made = begun(tmp_path, fresh=False)
+    made = begun(tmp_path, resample_each_epoch=False)
     count = len(made.data.samples(2, 0)[0])
     orders = []
     for phase, epoch in ((1, 0), (1, 1), (2, 0), (2, 1)):

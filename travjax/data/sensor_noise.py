@@ -3,7 +3,7 @@
 Everything is NumPy on the host. Maps are [n, rows, cols] metres.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -18,29 +18,29 @@ Maps = Float[np.ndarray, "n rows cols"]
 class CorruptionConfig:
     """How training maps are corrupted, newly drawn each time; the labels remain those of the clean maps.
 
-    share:   share of the maps that are corrupted; the others stay unchanged
-    noise:   metres; the standard deviation of the noise is uniform from 0 to this
-    missing: in half of the corrupted maps, the share of missing nodes is uniform from 0 to this
-    coarse:  share of the corrupted maps that keep only every second node
+    probability: that a map is corrupted; the others stay unchanged
+    noise:       metres; the standard deviation of the noise is uniform from 0 to this
+    missing:     in half of the corrupted maps, the share of missing nodes is uniform from 0 to this
+    coarse:      share of the corrupted maps that keep only every second node
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
 
-    share: float = 0.0
+    probability: float = field(default=0.0, metadata={"formerly": "share"})
     noise: float = 0.06
     missing: float = 0.25
     coarse: float = 0.2
 
     def __post_init__(self):
         require_number("noise", self.noise, -1e-300, 1, "metres, from 0 to 1")
-        for name, most in (("share", 1), ("missing", 0.9), ("coarse", 1)):
+        for name, most in (("probability", 1), ("missing", 0.9), ("coarse", 1)):
             require_number(name, getattr(self, name), -1e-300, most, f"a share from 0 to {most}")
 
 
 def corrupted(maps: Maps, config: CorruptionConfig, rng: np.random.Generator) -> Maps:
     """Corrupts maps at random as a sensor might, and fills missing nodes; float32."""
     result = np.array(maps, np.float32)
-    for index in np.flatnonzero(rng.random(len(maps)) < config.share):
+    for index in np.flatnonzero(rng.random(len(maps)) < config.probability):
         one = result[index : index + 1]
         if rng.random() < config.coarse:
             one = upsampled(one)

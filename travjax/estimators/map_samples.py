@@ -133,7 +133,7 @@ class MapSamples:
 
     def _arcs(self, table: Stencil, rng: np.random.Generator) -> np.ndarray:
         """First arcs whose trajectories a step sees."""
-        count = min(max(self.config.each // table.second_arcs, 1), len(table.nodes))
+        count = min(max(self.config.trajectories_per_map // table.second_arcs, 1), len(table.nodes))
         return np.sort(rng.choice(len(table.nodes), count, replace=False))
 
     def summary(self) -> str:

@@ -1,6 +1,6 @@
 """Everything that a training run is made from, as one TOML file (presets/resnet50, presets/field)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import optax
@@ -17,7 +17,7 @@ from travjax.resnet.network import ResNetConfig
 
 SCHEDULES = ("constant", "cosine")
 
-METHODS = ("rmsprop", "adamw")
+OPTIMIZERS = ("rmsprop", "adamw")
 
 IMAGENET_WEIGHTS = "imagenet/resnet50_imagenet.npz"
 """The name of ImageNet weights that may be any: where there is no such file, others are fetched."""
@@ -43,16 +43,16 @@ class TrainingConfig:
     batch_size:           samples a step
     head_epochs:          phase 1: epochs of the heads on the features of the frozen trunk
     epochs:               phase 2: epochs of everything
-    method:               "rmsprop", or "adamw" with its usual settings
+    optimizer:            "rmsprop", or "adamw" with its usual settings
     learning_rate:        its largest
     decay, epsilon:       of RMSprop
-    clip:                 gradients longer than this are cut to it; 0 leaves them as they are
+    max_grad_norm:        gradients longer than this are cut to it; 0 leaves them as they are
     schedule:             of phase 2: "constant", or "cosine" down to zero
     warmup_steps:         steps of phase 2 over which the learning rate rises from zero
     weight_decay:         times the sum of squares of the heads' kernels, added to the loss; with "adamw" its own decay
-    each, failing:        trajectories a map in an epoch, and how many of them fail if as many do; for the hazard field
-                          trajectories a map in a step, whole first arcs of them, as frequent as they are
-    fresh:                a new subset of trajectories each epoch instead of the same one (phase 2)
+    trajectories_per_map: in an epoch; for the hazard field in a step, whole first arcs, as frequent as they are
+    failing_per_map:      how many of these fail if as many do
+    resample_each_epoch:  a new subset of trajectories each epoch instead of the same one (phase 2)
     subset_seed:          of the subsets alone, so that runs of other seeds train on the same samples; `seed` if none
     validation_samples:   at most this many of the validation maps' balanced subset
     checkpoint_steps:     steps from one checkpoint to the next; there is one after each epoch as well
@@ -64,39 +64,42 @@ class TrainingConfig:
     batch_size: int = 64
     head_epochs: int = 1
     epochs: int = 10
-    method: str = "rmsprop"
+    optimizer: str = field(default="rmsprop", metadata={"formerly": "method"})
     learning_rate: float = 1e-4
     decay: float = 0.9
     epsilon: float = 1e-7
-    clip: float = 0.0
+    max_grad_norm: float = field(default=0.0, metadata={"formerly": "clip"})
     schedule: str = "constant"
     warmup_steps: int = 0
     weight_decay: float = 0.001
-    each: int = 11
-    failing: int = 6
-    fresh: bool = False
+    trajectories_per_map: int = field(default=11, metadata={"formerly": "each"})
+    failing_per_map: int = field(default=6, metadata={"formerly": "failing"})
+    resample_each_epoch: bool = field(default=False, metadata={"formerly": "fresh"})
     subset_seed: int | None = None
     validation_samples: int = 100_000
     checkpoint_steps: int = 500
 
     def __post_init__(self):
-        _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing", least=0)
-        _require_counts(self, "batch_size", "each", "validation_samples", "checkpoint_steps", least=1)
+        _require_counts(self, "seed", "head_epochs", "epochs", "warmup_steps", "failing_per_map", least=0)
+        _require_counts(self, "batch_size", "trajectories_per_map", "validation_samples", "checkpoint_steps", least=1)
         if self.subset_seed is not None:
             _require_counts(self, "subset_seed", least=0)
-        require(self.failing <= self.each, "failing", self.failing, f"at most each = {self.each}")
+        most = f"at most trajectories_per_map = {self.trajectories_per_map}"
+        require(self.failing_per_map <= self.trajectories_per_map, "failing_per_map", self.failing_per_map, most)
         require_number("learning_rate", self.learning_rate, 0, 10, "above 0 and at most 10")
         require_number("decay", self.decay, 0, 1, "above 0 and at most 1")
         require_number("epsilon", self.epsilon, 0, 1, "above 0 and at most 1")
-        require_number("clip", self.clip, -1e-300, 1e6, "from 0 to 1000000")
-        require(self.method in METHODS, "method", self.method, f"one of {', '.join(METHODS)}")
+        require_number("max_grad_norm", self.max_grad_norm, -1e-300, 1e6, "from 0 to 1000000")
+        require(self.optimizer in OPTIMIZERS, "optimizer", self.optimizer, f"one of {', '.join(OPTIMIZERS)}")
         require_number("weight_decay", self.weight_decay, -1e-300, 10, "from 0 to 10")
         require(self.schedule in SCHEDULES, "schedule", self.schedule, f"one of {', '.join(SCHEDULES)}")
-        require(type(self.fresh) is bool, "fresh", self.fresh, "true or false")
+        require(
+            type(self.resample_each_epoch) is bool, "resample_each_epoch", self.resample_each_epoch, "true or false"
+        )
         require(self.head_epochs + self.epochs > 0, "epochs", self.epochs, "at least 1 where head_epochs is 0")
 
     @property
-    def drawn_by(self) -> int:
+    def sampling_seed(self) -> int:
         """The seed of the subsets."""
         return self.seed if self.subset_seed is None else self.subset_seed
 
@@ -109,33 +112,33 @@ class TrainingConfig:
             return optax.warmup_constant_schedule(0.0, rate, warmup)
         return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, max(steps, warmup + 1))
 
-    def optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
-        """The method for the `steps` of a phase."""
+    def make_optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
+        """The optimizer for the `steps` of a phase."""
         rate = self.schedule_of(phase, steps)
-        if self.method == "adamw":
+        if self.optimizer == "adamw":
             made = optax.adamw(rate, weight_decay=self.weight_decay)
         else:
             made = optax.rmsprop(rate, self.decay, self.epsilon, eps_in_sqrt=False)
-        return optax.chain(optax.clip_by_global_norm(self.clip), made) if self.clip else made
+        return optax.chain(optax.clip_by_global_norm(self.max_grad_norm), made) if self.max_grad_norm else made
 
     @property
     def penalty(self) -> float:
         """The weight decay that is part of the loss."""
-        return 0.0 if self.method == "adamw" else self.weight_decay
+        return 0.0 if self.optimizer == "adamw" else self.weight_decay
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
     """The sample of the test maps that is evaluated, at natural frequency.
 
-    maps: test maps; each: random trajectories of each map; 0 for all
+    maps: test maps; trajectories_per_map: random ones; 0 for all
     """
 
     maps: int = 0
-    each: int = 0
+    trajectories_per_map: int = field(default=0, metadata={"formerly": "each"})
 
     def __post_init__(self):
-        _require_counts(self, "maps", "each", least=0)
+        _require_counts(self, "maps", "trajectories_per_map", least=0)
 
 
 @dataclass(frozen=True)

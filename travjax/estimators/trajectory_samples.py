@@ -23,7 +23,8 @@ class TrajectorySamples:
     def __init__(self, dataset: Dataset, config: TrainingConfig):
         self.dataset, self.config = dataset, config
         maps = dataset.maps_of("train")
-        self._sampler = Sampler(dataset.labels, maps, config.drawn_by, config.each, config.failing, config.fresh)
+        each, failing, fresh = config.trajectories_per_map, config.failing_per_map, config.resample_each_epoch
+        self._sampler = Sampler(dataset.labels, maps, config.sampling_seed, each, failing, fresh)
         self._kept: dict[int, Samples] = {}
         for split, samples in (("train", self.samples(1, 0)), ("validation", self.validation)):
             require(len(samples[0]) > 0, f"data set, {split} split", 0, "at least one known trajectory")
@@ -41,8 +42,9 @@ class TrajectorySamples:
     def validation(self) -> Samples:
         """The balanced subset of the validation maps, or as many of it as the configuration allows."""
         config, maps = self.config, self.dataset.maps_of("validation")
-        samples = balanced_subset(self.dataset.labels, maps, config.drawn_by, config.each, config.failing)
-        keys = random_keys(("validation", config.drawn_by), np.arange(len(samples[0])))
+        each, failing = config.trajectories_per_map, config.failing_per_map
+        samples = balanced_subset(self.dataset.labels, maps, config.sampling_seed, each, failing)
+        keys = random_keys(("validation", config.sampling_seed), np.arange(len(samples[0])))
         chosen = np.sort(np.argsort(keys)[: config.validation_samples])
         return samples[0][chosen], samples[1][chosen]
 

@@ -7,6 +7,7 @@ under experiments/transfer.
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from travjax import options, progress
-from travjax.config import InputError, load_toml, read_json, read_text, require, to_json
+from travjax.config import InputError, from_json, load_toml, read_json, read_text, require, to_json
 from travjax.data import dataset
 from travjax.data.build import build_from_sites
 from travjax.data.dataset import Dataset
@@ -116,21 +117,21 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
 def _require_same(out: Path, config: TransferConfig) -> None:
     """Keeps the configuration in the folder, and refuses a folder with another one; its FILES may have moved."""
     path = out / "config.json"
-    text = json.dumps(to_json(config), indent=1) + "\n"
-    if path.exists() and _without_files(read_json(path)) != _without_files(json.loads(text)):
+    if path.exists() and not _is_of(path, config):
         raise InputError(
             f"--out {out}: holds an experiment of another preset; allowed: another folder, or the same preset"
         )
-    save_text(path, text)
+    save_text(path, json.dumps(to_json(config), indent=1) + "\n")
 
 
-FILES = ("sites", "synthetic")
-"""What of a preset names other files; what these say is compared where the runs and their data set go on."""
-
-
-def _without_files(settings: Any) -> Any:
-    """Returns the settings of a preset without the names of its FILES."""
-    return {k: v for k, v in settings.items() if k not in FILES} if isinstance(settings, dict) else settings
+def _is_of(path: Path, config: TransferConfig) -> bool:
+    """Tells whether a file holds a configuration, but for the files it names: these are compared where runs go on."""
+    table = read_json(path)
+    try:
+        kept = from_json(table, TransferConfig, path)
+    except InputError:
+        return False
+    return replace(kept, sites=config.sites, synthetic=config.synthetic) == config
 
 
 def _base(preset: Path, arguments: argparse.Namespace) -> Run:

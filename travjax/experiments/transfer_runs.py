@@ -6,7 +6,7 @@ are computed once for all seeds; with `epochs` everything is trained, as in the 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -44,10 +44,10 @@ class TransferConfig:
     sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
     synthetic:  preset that trains the synthetic model
     seeds:      of the runs of each arm: order, dropout, first weights that are random
-    each:       random known trajectories of each held-out window that are scored, 0 for all
     shown:      held-out site in the figure of maps; its licence must allow that
     shown_maps: number of its windows there
     training:   `head_epochs` for frozen trunks or `epochs` for all of it, not both
+    trajectories_per_map: random known ones of each held-out window that are scored, 0 for all
 
     Files are named from the folder of the preset. Raises InputError that names field, value and what is allowed.
     """
@@ -55,7 +55,7 @@ class TransferConfig:
     sites: str = "../sites/real.toml"
     synthetic: str = "../resnet50/laptop.toml"
     seeds: tuple[int, ...] = (0, 1, 2)
-    each: int = 200
+    trajectories_per_map: int = field(default=200, metadata={"formerly": "each"})
     shown: str = "mars_live_site"
     shown_maps: int = 2
     training: TrainingConfig = TrainingConfig()
@@ -63,7 +63,7 @@ class TransferConfig:
     def __post_init__(self):
         for name in ("sites", "synthetic", "shown"):
             require(isinstance(getattr(self, name), str), name, getattr(self, name), "a text")
-        for name in ("each", "shown_maps"):
+        for name in ("trajectories_per_map", "shown_maps"):
             value = getattr(self, name)
             require(type(value) is int and 0 <= value <= MOST, name, value, f"a whole number from 0 to {MOST}")
         whole = isinstance(self.seeds, tuple) and bool(self.seeds)
@@ -114,7 +114,7 @@ class Transfer:
         """What a run is made from: the synthetic model's settings, trained as the experiment says."""
         preset = self.base.preset
         weights = {SCRATCH: "none", IMAGENET: preset.weights}.get(arm, f"{self.synthetic}")
-        training = replace(self.config.training, seed=seed, subset_seed=self.config.training.drawn_by)
+        training = replace(self.config.training, seed=seed, subset_seed=self.config.training.sampling_seed)
         return replace(self.base, preset=replace(preset, weights=weights, training=training))
 
     def place_of(self, arm: str, seed: int) -> Path:
@@ -129,9 +129,9 @@ class Transfer:
         if not self._is_finished(place, run):
             self._train(arm, seed, place)
         path = place / "metrics.jsonl"
-        rows = [row for row in read_rows(path) if "watched" in row]
+        rows = [row for row in read_rows(path) if "eval_sets" in row]
         found, last, sites = [row.get("epoch") for row in rows], self.config.epochs, list(self.held_out)
-        scored = all(isinstance(row["watched"], dict) and list(row["watched"]) == sites for row in rows)
+        scored = all(isinstance(row["eval_sets"], dict) and list(row["eval_sets"]) == sites for row in rows)
         anew = f"0 to {last}, each with scores of {', '.join(sites)}; remove the folder to train it anew"
         require(found == list(range(last + 1)) and scored, f"{path}: epochs", found, anew)
         return rows
@@ -166,7 +166,7 @@ class Transfer:
         run = self.run_of(arm, seed)
         features = self._kept_features(arm)
         trainer = Trainer(
-            run, self.dataset, output_folder(place), self.devices, watched=self.held_out, features=features
+            run, self.dataset, output_folder(place), self.devices, eval_sets=self.held_out, features=features
         )
         if self.devices.main:
             run.save(place)
@@ -221,7 +221,7 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
     test = dataset.maps_of("test")
     require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
     sites = list(dict.fromkeys(dataset.group[test].tolist()))
-    each, seed = config.each or len(dataset.actions), config.training.drawn_by
+    each, seed = config.trajectories_per_map or len(dataset.actions), config.training.sampling_seed
     of = lambda site: natural_sample(dataset.labels, test[dataset.group[test] == site], seed, len(test), each)
     return {site: of(site) for site in sites}
 

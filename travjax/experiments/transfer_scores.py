@@ -46,12 +46,12 @@ class Epoch:
 
     @staticmethod
     def from_row(row: Mapping) -> "Epoch":
-        """Reads a row of metrics.jsonl with the scores of watched samples; raises InputError for another row."""
+        """Reads a row of metrics.jsonl with the scores of `eval_sets`; raises InputError for another row."""
         allowed = "counts of every event on each held-out site; remove the run's folder to train it anew"
         require(_is_scored(row), "row of metrics.jsonl", row, allowed)
         sites = {
             site: {name: Confusion(*(one["confusion"][count] for count in COUNTS)) for name, one in scores.items()}
-            for site, scores in row["watched"].items()
+            for site, scores in row["eval_sets"].items()
         }
         if len(sites) > 1:
             first = next(iter(sites.values()))
@@ -63,7 +63,7 @@ class Epoch:
 def _is_scored(row: Mapping) -> bool:
     """Tells whether a row holds counts of every event on each site, and a number from validation if any."""
     at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
-    sites, precision = row.get("watched"), row.get("average_precision")
+    sites, precision = row.get("eval_sets"), row.get("average_precision")
     if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
         return False
     names = dict.fromkeys((*NAMES, *(name for site in sites.values() if isinstance(site, Mapping) for name in site)))

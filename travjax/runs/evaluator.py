@@ -123,8 +123,9 @@ class Evaluator:
     def regression(self, samples: Samples) -> np.ndarray:
         """Probabilities of samples by the baseline's regression, fitted to training maps: [k, events]."""
         config, run, heights = self.run.preset.training, self.run, self.dataset.heights
-        maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.each)]
-        known = balanced_subset(self.dataset.labels, maps, config.seed, config.each, config.failing)
+        maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.trajectories_per_map)]
+        each, failing = config.trajectories_per_map, config.failing_per_map
+        known = balanced_subset(self.dataset.labels, maps, config.seed, each, failing)
         features = [slope_and_step(heights, part, run.actions, run.grid) for part in (known, samples)]
         return LogisticRegression.fit(features[0], self.failed(known)).probabilities(features[1])
 

@@ -66,9 +66,7 @@ def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | N
     seen, field = preset.corruption, trained.kind.reads_whole_maps
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
     measured = tables or "not evaluated: `travjax evaluate` writes the tables"
-    corrupted = (
-        f"| corrupted | {seen.share:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
-    )
+    corrupted = f"| corrupted | {seen.probability:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
     beside_simulator = _beside_simulator(real)
     margins = "Regressed margins are not told apart above four times a limit. "
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"

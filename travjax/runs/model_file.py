@@ -35,7 +35,7 @@ def read_model(path: Path) -> tuple[Run, Network, dict]:
     """
     try:
         with open_arrays(path) as file:
-            run, notes = _described(file.notes)
+            run, notes = _described(file.notes, path)
             template = run.template(0)
             arrays = _read(file, named_leaves(template))
     except InputError as error:
@@ -46,11 +46,11 @@ def read_model(path: Path) -> tuple[Run, Network, dict]:
     return run, merge_model(run.graph(), variables), notes
 
 
-def _described(notes: dict) -> tuple[Run, dict]:
+def _described(notes: dict, path: Path) -> tuple[Run, dict]:
     """The run and the notes that write_model was given."""
     try:
         if notes.keys() == {"run", "notes"} and isinstance(notes["notes"], dict):
-            return Run.from_json(notes["run"]), notes["notes"]
+            return Run.from_json(notes["run"], path), notes["notes"]
     except InputError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):

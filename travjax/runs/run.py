@@ -56,9 +56,9 @@ class Run:
         return {name: to_json(getattr(self, name)) for name in _PARTS}
 
     @staticmethod
-    def from_json(table: Any) -> "Run":
-        """The inverse of `to_json`; raises InputError over another table."""
-        return Run(**parts_from_json(table, _PARTS))
+    def from_json(table: Any, where: object = "saved settings") -> "Run":
+        """The inverse of `to_json`; prints which keys of `where` are old, and raises InputError over another table."""
+        return Run(**parts_from_json(table, _PARTS, where))
 
     @staticmethod
     def load(folder: str | Path) -> "Run":
@@ -66,13 +66,13 @@ class Run:
         path = user_path(folder) / "run.json"
         table = read_json(path, "the folder of a training run")
         try:
-            return Run.from_json(table)
+            return Run.from_json(table, path)
         except InputError as error:
             raise InputError(f"{path}: {error}") from None
 
     def require_same_settings(self, other: "Run", what: str) -> None:
         """Raises InputError that names the first setting in which the other run differs."""
-        free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.each")}
+        free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.trajectories_per_map")}
         for name, mine, others in _settings(self, other):
             if mine != others and name not in free:
                 raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
@@ -112,7 +112,7 @@ class Run:
             variables = split_model(self.create())[1]
             if phase:
                 trained = {name: variables[name] for name in phases[phase].trained}
-                variables |= {"optimizer": self.preset.training.optimizer(phase, 1).init(trained)}
+                variables |= {"optimizer": self.preset.training.make_optimizer(phase, 1).init(trained)}
             return variables
 
         shaped = lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding)
@@ -150,7 +150,7 @@ def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict
     require(whole, f"{where}: position", told, f"numbers named {', '.join(COUNTS + SUMS)}")
     if run and "run" in meta:
         try:
-            trained = Run.from_json(meta["run"])
+            trained = Run.from_json(meta["run"], where)
         except InputError as error:
             raise InputError(f"{where}: run: {error}") from None
         trained.require_same_settings(run, f"{user_path(folder) / 'run.json'}")

@@ -6,8 +6,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from travjax.config import InputError, one_line, parse_json
+from travjax.config import InputError, one_line, parse_json, say_renamed
 from travjax.files import save_text
+
+FORMERLY = {"watched": "eval_sets"}
+"""Old keys of rows, and what they are called now."""
 
 
 class RunLog:
@@ -63,6 +66,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     """Reads the rows of a metrics.jsonl, none if there is no file, and prints which lines are no rows with their step.
 
     They are left out: a run does not stop over a damaged log. A last line that was cut short is passed over in silence.
+    Old keys are taken for what they are called now, and named in a line; a row must not have both.
     Raises InputError when the file cannot be read.
     """
     try:
@@ -76,7 +80,9 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     if damaged:
         numbers = f"line {damaged[0]}" if len(damaged) == 1 else f"{len(damaged)} lines from {damaged[0]} on"
         print(one_line(f"{path}: {numbers} left out: must be a row of JSON with its step"))
-    return [row for row in (*found, _row(last)) if row is not None]
+    rows = [row for row in (*found, _row(last)) if row is not None]
+    say_renamed(path, {old: new for old, new in FORMERLY.items() if any(old in row for row in rows)})
+    return [{FORMERLY.get(key, key): value for key, value in row.items()} for row in rows]
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
@@ -85,4 +91,6 @@ def _row(line: bytes) -> dict[str, Any] | None:
         row = parse_json(line.decode(), "row")
     except (UnicodeDecodeError, InputError):
         return None
-    return row if isinstance(row, dict) and type(row.get("step")) is int and row["step"] >= 0 else None
+    if not isinstance(row, dict) or any(old in row and new in row for old, new in FORMERLY.items()):
+        return None
+    return row if type(row.get("step")) is int and row["step"] >= 0 else None

@@ -55,7 +55,8 @@ def evaluate_run(
     name = "evaluation" if checkpoint == "best" else f"evaluation_{checkpoint}"
     written = output_folder(out or place / name)
     sampled = trained.preset.evaluation
-    samples = evaluator.samples(sampled.maps if maps is None else maps, sampled.each if each is None else each)
+    count = sampled.trajectories_per_map if each is None else each
+    samples = evaluator.samples(sampled.maps if maps is None else maps, count)
     scores = evaluator.scores(_probabilities(evaluator, estimator, samples, "test samples"), samples, recalls)
     others = _baselines(place, evaluator, samples, recalls) if baselines else {}
     description = _description(evaluator, samples, checkpoint, meta["position"])

@@ -91,7 +91,7 @@ class Bench:
 
     def training_step(self) -> dict:
         """Everything trained, from sample indices to new parameters."""
-        phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().optimizer(2, 1)
+        phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().make_optimizer(2, 1)
         settings = StepSettings(self.graph, phase, optimizer, penalty=0.001)
         trained = {name: self.variables[name] for name in phase.trained}
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}

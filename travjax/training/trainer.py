@@ -62,7 +62,7 @@ class Trainer:
     """One training run.
 
     data: what is trained on; state: that of step.py; position: where it stands
-    watched: named samples on which each epoch is scored beside the validation, and the first state; training does not
+    eval_sets: named samples on which each epoch is scored beside the validation, and the first state; training does not
         depend on them
     features: of the frozen trunk, as `features` of another run of the same trunk and samples; else they are computed
     Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
@@ -76,7 +76,7 @@ class Trainer:
         folder: Path,
         devices: Devices,
         quiet: bool = False,
-        watched: Mapping[str, Samples] | None = None,
+        eval_sets: Mapping[str, Samples] | None = None,
         features: Mapping[str, np.ndarray] | None = None,
     ):
         require_matching(dataset, run.robot, run.actions, run.grid)
@@ -85,7 +85,7 @@ class Trainer:
         self.kind, self.config = run.kind, run.preset.training
         self.data = self.kind.data(run.preset, dataset)
         self.quiet = quiet or not devices.main
-        self.scored = {"validation": self.data.validation} | dict(watched or {})
+        self.scored = {"validation": self.data.validation} | dict(eval_sets or {})
         self.checkpoints = Checkpoints(folder / "checkpoints")
         self.position = Position()
         self._given_features = features
@@ -187,7 +187,7 @@ class Trainer:
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
         if phase not in self._optimizers:  # the same object each time: jit compiles for it
-            self._optimizers[phase] = self.config.optimizer(phase, self._planned_steps(phase))
+            self._optimizers[phase] = self.config.make_optimizer(phase, self._planned_steps(phase))
         return self._optimizers[phase]
 
     def _train_epoch(self) -> None:
@@ -268,13 +268,13 @@ class Trainer:
         }
 
     def _watched(self) -> dict[str, Any]:
-        """Confusion and average precision of each event, and overall, on the watched samples."""
+        """Confusion and average precision of each event, and overall, on the samples of `eval_sets`."""
         names = [name for name in self.scored if name != "validation"]
         failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
         events = self.run.robot.event_names
         score = lambda name: metrics.evaluate(probabilities(self._logits(name)), failed[name], events=events).scores
         scores = {name: score(name) for name in names}
-        return {"watched": metrics.json_ready(scores)} if names else {}
+        return {"eval_sets": metrics.json_ready(scores)} if names else {}
 
     def _logits(self, name: str) -> np.ndarray:
         """Returns the logits of the samples of that name, by the present state: [k, events]."""
