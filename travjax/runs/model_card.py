@@ -66,9 +66,12 @@ def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | N
     seen, field = preset.corruption, trained.kind.reads_whole_maps
     parameters = sum(leaf.size for leaf in jax.tree.leaves(trained.template(0)))
     measured = tables or "not evaluated: `travjax evaluate` writes the tables"
-    corrupted = f"| corrupted | {seen.probability:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution |\n"
-    beside_simulator = _beside_simulator(real)
-    margins = "Regressed margins are not told apart above four times a limit. "
+    corrupted = beside_simulator = margins = ""
+    if field:
+        maps = f"{seen.probability:.0%} of the maps: noise up to {seen.noise:g} m, missing nodes, half resolution"
+        corrupted = f"| corrupted | {maps} |\n"
+        beside_simulator = _beside_simulator(real)
+        margins = "Regressed margins are not told apart above four times a limit. "
     data = f"{preset.dataset.maps:,} synthetic maps of seed {preset.dataset.seed}"
     return f"""# {name}
 
@@ -80,15 +83,15 @@ def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | N
 | robot | {trained.robot.name}; another one needs training: `travjax train PRESET --robot FILE` |
 | maps | {grid.size:g} x {grid.size:g} m at {grid.spacing:g} m, {len(trained.actions)} trajectories |
 | trained on | {data} (fingerprint {notes["dataset"]}), seed {preset.training.seed}, {notes["step"]:,} steps |
-{corrupted * field}
+{corrupted}
 ## Evaluation
 
 ```
 {measured}
 ```
-{beside_simulator * field}
+{beside_simulator}
 Limits: labels are those of a kinematic simulator on synthetic terrain, without friction, dynamics or soft ground.
-{margins * field}Do not let it drive a robot unwatched.
+{margins}Do not let it drive a robot unwatched.
 """
 
 
