@@ -32,7 +32,7 @@ PRESETS = Path(__file__).parent / "presets"
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """A temporary path of the same name to write to; it becomes `path` when the block ends well, else it is removed.
+    """Yields a temporary path to write to, which becomes `path` when the block ends well and is removed otherwise.
 
     Raises InputError when it cannot be written: a full disk, a folder in the way.
     """
@@ -44,7 +44,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write_folder(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
-    """A temporary folder to write to; it becomes `folder` when the block ends well, else it is removed.
+    """Yields a temporary folder to write to, which becomes `folder` when the block ends well and is removed otherwise.
 
     At any moment the old or the new one is in its place, where the file system can exchange two names; elsewhere the
     next process that writes there, or that looks for it by `put_back`, brings back the old one after a kill.
@@ -85,7 +85,7 @@ def _input_error(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _unfinished(folder: Path) -> Iterator[Path]:
-    """A hidden folder of this process alone within a folder, for what is being written; it is removed at the end."""
+    """Yields a hidden folder of this process within a folder, for what is being written; it is removed at the end."""
     _remove_remains(folder)
     place, lock = _locked_folder(folder)
     try:
@@ -223,7 +223,7 @@ def require_replaceable(path: Path, ours: Callable[[Path], bool], option: str, w
 
 
 def first_lines(path: Path, count: int) -> list[str]:
-    """The first lines of a text file, fewer if it has no more; none if it cannot be read."""
+    """Returns the first lines of a text file, fewer if it has no more, and none if it cannot be read."""
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             return [file.readline(1000).rstrip("\n") for _ in range(count)]
@@ -232,12 +232,12 @@ def first_lines(path: Path, count: int) -> list[str]:
 
 
 def user_path(path: str | Path) -> Path:
-    """The path that a user gives, with their home for ~; without a home it stays as it is."""
+    """Expands ~ in a path that a user gives; without a home it stays as it is."""
     return Path(os.path.expanduser(path))
 
 
 def resolved(path: Path) -> Path:
-    """The path without symbolic links. Raises InputError when one of them leads to itself."""
+    """Returns the path without symbolic links. Raises InputError when one of them leads to itself."""
     try:
         return path.resolve()
     except (OSError, RuntimeError):  # the latter up to Python 3.12
@@ -245,7 +245,7 @@ def resolved(path: Path) -> Path:
 
 
 def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX_DATA") -> Path:
-    """The file of that name, here or under TRAVJAX_DATA.
+    """Finds the file of that name, here or under TRAVJAX_DATA.
 
     Raises InputError that says what it is, where it was looked for, and what is allowed.
     """
@@ -271,13 +271,13 @@ def find_preset(given: str | Path, kind: str) -> Path:
 
 
 def sha256(path: Path) -> str:
-    """The checksum of a file, in hexadecimal; it is read piece by piece."""
+    """Returns the SHA-256 of a file in hexadecimal; the file is read piece by piece."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cache_folder() -> Path | None:
-    """Where the user's machine keeps what can be made again; None for a user without a home."""
+    """Returns the folder for what can be made again, or None for a user without a home."""
     home = os.path.expanduser("~") if os.environ.get("HOME") != "" else ""
     given = os.environ.get("XDG_CACHE_HOME", "")
     place = given if os.path.isabs(given) else os.path.join(home, ".cache")  # the standard has relative ones ignored

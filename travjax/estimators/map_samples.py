@@ -48,16 +48,16 @@ class MapSource:
     def from_maps(
         heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float
     ) -> "MapSource":
-        """heights: [n, rows, cols] metres; an unknown node gets the height of the nearest known one."""
+        """Takes heights [n, rows, cols] in metres; an unknown node gets the height of the nearest known one."""
         return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
 
     def elevation(self, map_index: Int[Array, " b"]) -> Float[Array, "b rows cols"]:
-        """What the network sees of maps."""
+        """Returns what the network sees of maps."""
         return relative(self.heights[map_index], self.elevation_scale)
 
 
 def relative(heights, scale):
-    """Heights [b, rows, cols] above that at the centre, in units of a scale."""
+    """Returns heights [b, rows, cols] above that at the centre, in units of a scale."""
     middle = heights.shape[-1] // 2
     return (heights - heights[:, middle, middle, None, None]) / scale
 
@@ -86,15 +86,15 @@ class MapSamples:
         return every_sample(self.dataset.labels, self.maps)
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, events] float32."""
+        """Returns the failures of samples: [k, events] float32."""
         return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
-        """Maps of an epoch."""
+        """Returns the number of maps of an epoch."""
         return len(self.maps)
 
     def steps(self, phase: int, epoch: int = 0) -> int:
-        """Batches of an epoch."""
+        """Returns the number of batches of an epoch."""
         return -(-len(self.maps) // self.config.batch_size)
 
     def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
@@ -132,12 +132,12 @@ class MapSamples:
         return (relative(seen, np.float32(preset.elevation_scale)), part), targets
 
     def _arcs(self, table: Stencil, rng: np.random.Generator) -> np.ndarray:
-        """First arcs whose trajectories a step sees."""
+        """Draws the first arcs whose trajectories a step sees."""
         count = min(max(self.config.trajectories_per_map // table.second_arcs, 1), len(table.nodes))
         return np.sort(rng.choice(len(table.nodes), count, replace=False))
 
     def summary(self) -> str:
-        """What is trained on, for people."""
+        """Says in one line what is trained on."""
         return f"{len(self.maps)} training maps; {len(self.validation[0])} validation samples"
 
 
@@ -149,7 +149,7 @@ def _batch(prepared: Future, weight: np.ndarray) -> Batch:
 
 @partial(jax.jit, static_argnames="limits")
 def _targets(margins, trajectories, limits):
-    """Margins of trajectories in units of the limits, and whether they are known."""
+    """Returns margins of trajectories in units of the limits, and whether they are known."""
     chosen = margins[:, trajectories] / jnp.asarray(limits, jnp.float32)
     known = ~jnp.isnan(chosen[..., 0])
     return jnp.where(known[..., None], chosen, 0), known

@@ -104,7 +104,7 @@ class TrainingConfig:
         return self.seed if self.subset_seed is None else self.subset_seed
 
     def schedule_of(self, phase: int, steps: int) -> optax.Schedule:
-        """The learning rate of each of the `steps` of a phase; it varies in phase 2 only."""
+        """Returns the learning rate of each of the `steps` of a phase; it varies in phase 2 only."""
         rate, warmup = self.learning_rate, self.warmup_steps
         if phase == 1 or self.schedule == "constant" and not warmup:
             return optax.constant_schedule(rate)
@@ -113,7 +113,7 @@ class TrainingConfig:
         return optax.warmup_cosine_decay_schedule(0.0, rate, warmup, max(steps, warmup + 1))
 
     def make_optimizer(self, phase: int, steps: int) -> optax.GradientTransformation:
-        """The optimizer for the `steps` of a phase."""
+        """Makes the optimizer for the `steps` of a phase."""
         rate = self.schedule_of(phase, steps)
         if self.optimizer == "adamw":
             made = optax.adamw(rate, weight_decay=self.weight_decay)

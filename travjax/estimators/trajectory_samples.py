@@ -30,7 +30,7 @@ class TrajectorySamples:
             require(len(samples[0]) > 0, f"data set, {split} split", 0, "at least one known trajectory")
 
     def samples(self, phase: int, epoch: int) -> Samples:
-        """Training samples of an epoch; phase 1 has the same ones in all."""
+        """Returns the training samples of an epoch; phase 1 has the same ones in all epochs."""
         number = 0 if phase == 1 else epoch + 1
         if number not in self._kept:
             # Those that steps are counted by stay; others are forgotten, a draw of a large data set takes a second.
@@ -49,15 +49,15 @@ class TrajectorySamples:
         return samples[0][chosen], samples[1][chosen]
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, events] float32."""
+        """Returns the failures of samples: [k, events] float32."""
         return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
-        """Samples of an epoch."""
+        """Returns the number of samples of an epoch."""
         return len(self.samples(phase, epoch)[0])
 
     def steps(self, phase: int, epoch: int = 0) -> int:
-        """Batches of an epoch."""
+        """Returns the number of batches of an epoch."""
         return -(-self.count(phase, epoch) // self.config.batch_size)
 
     def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
@@ -76,7 +76,7 @@ class TrajectorySamples:
             yield Batch(inputs, failed[index], weight)
 
     def summary(self) -> str:
-        """What is trained on, for people."""
+        """Says in one line what is trained on."""
         samples = self.samples(2, 0)
         share = self.failed(samples).any(axis=1).mean()
         return (

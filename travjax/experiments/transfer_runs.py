@@ -111,18 +111,18 @@ class Transfer:
         return ARMS if 1 in self.base.kind.phases else FIELD_ARMS
 
     def run_of(self, arm: str, seed: int) -> Run:
-        """What a run is made from: the synthetic model's settings, trained as the experiment says."""
+        """Returns what a run is made from: the synthetic model's settings, trained as the experiment says."""
         preset = self.base.preset
         weights = {SCRATCH: "none", IMAGENET: preset.weights}.get(arm, f"{self.synthetic}")
         training = replace(self.config.training, seed=seed, subset_seed=self.config.training.sampling_seed)
         return replace(self.base, preset=replace(preset, weights=weights, training=training))
 
     def place_of(self, arm: str, seed: int) -> Path:
-        """The folder of a run, which is one of `travjax train`."""
+        """Returns the folder of a run, which is one of `travjax train`."""
         return self.folder / "runs" / f"{_name(arm)}_{seed}"
 
     def rows(self, arm: str, seed: int) -> list[dict]:
-        """A row for the first state and for each epoch of a run, which is trained as far as it is not yet."""
+        """Trains a run as far as it is not trained yet; returns a row for its first state and for each epoch."""
         place, run = self.place_of(arm, seed), self.run_of(arm, seed)
         if has_checkpoints(place):
             self._require_same(place, run)
@@ -137,7 +137,7 @@ class Transfer:
         return rows
 
     def estimator(self, arm: str, seed: int) -> Network:
-        """Of the epoch that is best on the validation windows."""
+        """Loads the estimator of the epoch that is best on the validation windows."""
         return load_estimator(self.place_of(arm, seed), "best")[1]
 
     @cached_property
@@ -146,7 +146,7 @@ class Transfer:
         return load_estimator(self.synthetic, "best")[1]
 
     def _require_same(self, place: Path, run: Run) -> None:
-        """A run that was begun goes on with what it began with, and so do its figures."""
+        """Raises InputError where a run that was begun would go on with other settings."""
         begun = Run.load(place)
         begun.require_same_settings(run, f"{place}")
         first = begun.preset.weights
@@ -180,7 +180,7 @@ class Transfer:
         trainer.train()
 
     def _first(self, arm: str, seed: int) -> Network:
-        """Where a run begins; random trunks differ by seed unless they stay as they are."""
+        """Makes the network that a run begins with; random trunks differ by seed unless they stay frozen."""
         preset = self.base.preset
         if arm == self.arms[-1]:
             return self.pretrained

@@ -102,7 +102,11 @@ class UNet(nnx.Module):
         self.coarse = nnx.Param(_he_normal(rngs.params(), (1, 1, widths[0], 4 * learned), jnp.float32))
 
     def __call__(self, elevation: Float[Array, "b rows cols"], train: bool) -> Float[Array, "b rows cols c"]:
-        """elevation: of which one elevation scale is 1; with `train`, by the batch's statistics, as ConvNorm."""
+        """Returns the channels at all nodes.
+
+        elevation: in units of the elevation scale
+        train:     normalises by the batch's statistics, as ConvNorm does
+        """
         relief = elevation - _window_means(elevation)
         inputs = jnp.stack([relief, elevation / COARSE], axis=-1).astype(self.config.dtype)
         stem = jax.nn.relu(self.stem(inputs, train))
@@ -136,7 +140,7 @@ class PoseHead(nnx.Module):
         self.hazard.bias = nnx.Param(jnp.repeat(jnp.array([FIRST_LOGIT, 0.0], jnp.float32), events))
 
     def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b h"]:
-        """A logit of each event, then a margin of each in units of the robot's limits.
+        """Returns a logit of each event, then a margin of each in units of the robot's limits.
 
         The ground is seen relative to its mean over the stencil, and the mean beside it.
         """
@@ -157,13 +161,13 @@ class HazardField(nnx.Module):
     def __call__(
         self, elevation: Float[Array, "b rows cols"], stencil: Stencil, *, train: bool = False
     ) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
-        """Logits and margins, the margins in units of the robot's limits, of the trajectories of a stencil."""
+        """Returns logits and margins, the margins in units of the robot's limits, of the trajectories of a stencil."""
         arcs, poses, _ = stencil.nodes.shape
         hazard = self.at(self.trunk(elevation, train), stencil.nodes.reshape(arcs * poses, -1))
         return read_out(hazard.reshape(arcs, poses, *hazard.shape[1:]), stencil)
 
     def at(self, channels: Float[Array, "b rows cols c"], nodes) -> Float[Array, "p b h"]:
-        """The field at poses of stencils [p, s], from the channels at all nodes."""
+        """Returns the field at poses of stencils [p, s], from the channels at all nodes."""
         maps, rows, cols, count = channels.shape
         # Maps and channels side by side: a row is read for each node, and added to in the gradient, at full width.
         by_node = channels.reshape(maps, rows * cols, count).transpose(1, 0, 2).reshape(rows * cols, -1)
@@ -172,7 +176,7 @@ class HazardField(nnx.Module):
 
 
 def read_out(hazard: Float[Array, "f p b h"], stencil: Stencil) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
-    """Logits and margins of trajectories from those of their poses, in the order of a stencil's."""
+    """Returns logits and margins of trajectories from those of their poses, in the order of a stencil's."""
     first, rest = hazard[:, : stencil.first_poses], hazard[:, stencil.first_poses :]
     second = rest.reshape(len(hazard), stencil.second_arcs, -1, *hazard.shape[2:])
     events = hazard.shape[-1] // 2
@@ -185,25 +189,27 @@ def read_out(hazard: Float[Array, "f p b h"], stencil: Stencil) -> tuple[Float[A
 
 @usual_flags()
 def create(config: FieldConfig = FieldConfig(), seed: int = 0, events: int = len(EVENTS)) -> HazardField:
-    """An estimator of so many events with random parameters."""
+    """Makes a hazard field for so many events with random parameters."""
     trunk, heads = (nnx.Rngs(key_of(number)) for number in (seed, seed + 1))
     return HazardField(UNet(config, rngs=trunk), PoseHead(config, events, rngs=heads))
 
 
 def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:
-    """Mean of the RELIEF x RELIEF nodes around each, the map's edge repeated."""
+    """Returns the mean of the RELIEF x RELIEF nodes around each, the map's edge repeated."""
     edge = RELIEF // 2
     padded = jnp.pad(elevation, ((0, 0), (edge, edge), (edge, edge)), mode="edge")
     return lax.reduce_window(padded, 0.0, lax.add, (1, RELIEF, RELIEF), (1, 1, 1), "VALID") / RELIEF**2
 
 
 def _doubled(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols c"]:
-    """Each pixel four times, cut to a shape."""
+    """Repeats each pixel four times and cuts the result to a shape."""
     return images.repeat(2, axis=1).repeat(2, axis=2)[:, : shape[0], : shape[1]]
 
 
 def _four_nodes(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols _c"]:
-    """Four groups of channels at half resolution as the nodes (0, 0), (0, 1), (1, 0) and (1, 1) from each on."""
+    """Arranges four groups of channels at half resolution as the nodes (0, 0), (0, 1), (1, 0) and (1, 1) from each
+    on.
+    """
     maps, rows, cols, channels = images.shape
     spread = images.reshape(maps, rows, cols, 2, 2, channels // 4).transpose(0, 1, 3, 2, 4, 5)
     return spread.reshape(maps, 2 * rows, 2 * cols, channels // 4)[:, : shape[0], : shape[1]]

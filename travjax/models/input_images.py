@@ -59,7 +59,7 @@ def render_inputs(
     grid: Grid = Grid(),
     elevation_scale: float = 1.0,
 ) -> Float[Array, "*b rows cols 3"]:
-    """The network's inputs for samples of maps and trajectories.
+    """Returns the network's inputs for samples of maps and trajectories.
 
     heights:          [n, rows, cols] or [rows, cols] metres, NaN unknown, as for `simulate`
     map_index:        [b] integers or one, which map of the batch
@@ -116,7 +116,7 @@ class ImageSource:
         elevation_scale: float,
         on_progress: Callable[[int], object] = lambda count: None,
     ) -> "ImageSource":
-        """All trajectories on maps; arguments of `trajectory_bank`, whose bank it takes."""
+        """Puts all trajectories on maps; arguments of `trajectory_bank`, whose bank it takes."""
         bank = trajectory_bank(robot, actions, grid, on_progress=on_progress)
         return ImageSource(heights, bank, np.float32(elevation_scale))
 
@@ -142,7 +142,7 @@ def assemble(
 def elevation_channel(
     heights: Float[Array, "b rows cols"], scale: float | np.float32 | Float[Array, ""] = 1.0
 ) -> Float[Array, "b rows cols"]:
-    """Heights above the robot's in units of `scale` metres, clipped; unknown ground is 0.
+    """Returns heights above the robot's in units of `scale` metres, clipped; unknown ground is 0.
 
     Where the centre is unknown, the nearest known node's height stands for it.
     """
@@ -192,7 +192,7 @@ def trajectory_bank(
 
 
 def _read_bank(path: Path, configuration: str) -> np.ndarray | None:
-    """The bank in a file if it is whole, which the archive's checksums tell, and of this configuration."""
+    """Reads the bank of a file; None unless its checksums are right and it is of this configuration."""
     try:
         with path.open("rb") as file:
             archive = np.load(file)
@@ -243,7 +243,7 @@ def _arc_marks(start, radius, length: float, *, robot: Robot, widths, grid: Grid
 
 
 def _point_path(start, radius, length: float, right: float, forward: float) -> np.ndarray:
-    """The arc that a point of the robot describes: [k, 6].
+    """Returns the arc that a point of the robot describes: [k, 6].
 
     Its middle x, y; its radius; the unit vector from the centre of its circle to its middle; half its angle.
     """
@@ -262,7 +262,9 @@ def _point_path(start, radius, length: float, right: float, forward: float) -> n
 
 @jax.jit
 def _marks(paths, reach, axis):
-    """g(d; h) times 65535 for every node's distance d from paths [k, 5, 6], h = reach [5]: [k, 5, rows, cols]."""
+    """Returns g(d; h) times 65535 for every node's distance d from paths [k, 5, 6], h = reach [5]: [k, 5, rows,
+    cols].
+    """
 
     def mark(path, half_width):
         distance = _distance_to_arc(path, axis[None, :], axis[:, None])
@@ -273,7 +275,7 @@ def _marks(paths, reach, axis):
 
 
 def _distance_to_arc(path, x, y):
-    """From the circle within the arc's angle, elsewhere from the nearer of its ends, which mirror each other.
+    """Returns the distance to the circle within the arc's angle, elsewhere to the nearer of its ends.
 
     Nothing is measured from the circle's centre, which may lie far away.
     """

@@ -58,7 +58,7 @@ def stencil(robot: Robot, actions: ActionSpace, grid: Grid) -> Stencil:
 
 
 def nodes_at(poses: np.ndarray, radius: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid) -> Nodes:
-    """The stencils of poses [..., 3] on arcs of signed radius [...]: [..., s] int32. Places off the map are on
+    """Returns the stencils of poses [..., 3] on arcs of signed radius [...]: [..., s] int32. Places off the map are on
     its edge.
 
     The pose before is the one on the same arc, at the junction as well.
@@ -73,7 +73,7 @@ def nodes_at(poses: np.ndarray, radius: np.ndarray, robot: Robot, actions: Actio
 
 
 def _nodes(poses: np.ndarray, places: np.ndarray, grid: Grid) -> np.ndarray:
-    """Nodes nearest to places [k, 2] (right, forward) of the robot at poses [..., 3]: [..., k]."""
+    """Returns the nodes nearest to places [k, 2] (right, forward) of the robot at poses [..., 3]: [..., k]."""
     x, y, heading = (poses[..., axis, None] for axis in range(3))
     sin, cos, (right, forward) = np.sin(heading), np.cos(heading), places.T
     node = lambda coordinate: np.clip(nearest(coordinate, grid), 0, grid.cells)

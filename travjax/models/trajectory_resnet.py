@@ -58,7 +58,7 @@ class Heads(nnx.Module):
             setattr(self, event, Head(features, config, rngs=rngs))
 
     def __call__(self, features: Float[Array, "b f"], key: Key[Array, ""] | None = None) -> Float[Array, "b k"]:
-        """Logits in the order of the events; with a key, dropout leaves out units."""
+        """Returns logits in the order of the events; with a key, dropout leaves out units."""
         heads = [getattr(self, event) for event in self.events]
         keys = [None] * len(heads) if key is None else list(jax.random.split(key, len(heads)))
         return jnp.stack([head(features, key) for head, key in zip(heads, keys, strict=True)], axis=-1)
@@ -74,7 +74,7 @@ class Estimator(nnx.Module):
     def __call__(
         self, images: Float[Array, "b rows cols 3"], *, train: bool = False, key: Key[Array, ""] | None = None
     ) -> Float[Array, "b k"]:
-        """Logits in the order of the events.
+        """Returns logits in the order of the events.
 
         train: batch statistics in the trunk, and the running ones move; key: for dropout, none without it
         """
@@ -90,7 +90,7 @@ def create(
     weights: Weights | None = None,
     events: tuple[str, ...] = EVENTS,
 ) -> Estimator:
-    """An estimator of events, given by name, with random parameters, or with a trunk of `weights`.
+    """Makes an estimator of events, given by name, with random parameters, or with a trunk of `weights`.
 
     Raises InputError when the weights are those of another trunk.
     """

@@ -31,7 +31,7 @@ class Layout(NamedTuple):
     viewpoint: list[float]
 
     def dtype(self) -> np.dtype:
-        """One point in binary: field number k is pk."""
+        """Returns the type of one point in binary: field number k is pk."""
         return np.dtype([(f"p{number}", kind, (count,)) for number, (_, kind, count) in enumerate(self.fields)])
 
 

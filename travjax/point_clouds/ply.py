@@ -39,11 +39,11 @@ class Element:
     properties: list[tuple[str, str, str]] = field(default_factory=list)
 
     def lists(self) -> list[int]:
-        """Numbers of the properties that are lists."""
+        """Returns the numbers of the properties that are lists."""
         return [number for number, (_, _, length) in enumerate(self.properties) if length]
 
     def dtype(self, order: str, lengths: dict[int, int]) -> np.dtype:
-        """One in binary: property number k is field pk, the length of a list nk."""
+        """Returns the type of one in binary: property number k is field pk, the length of a list nk."""
         fields: list = []
         for number, (_, kind, length) in enumerate(self.properties):
             if length:
@@ -52,7 +52,7 @@ class Element:
         return np.dtype(fields)
 
     def least(self, order: str) -> int:
-        """Bytes that one takes at least; in text a digit and a blank for each value."""
+        """Returns the bytes that one takes at least; in text a digit and a blank for each value."""
         return self.dtype(order, dict.fromkeys(self.lists(), 0)).itemsize if order else 2 * len(self.properties)
 
 

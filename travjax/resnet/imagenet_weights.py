@@ -110,7 +110,9 @@ def load_weights(
 
 
 def _settings(file: WeightFile, network: Recognised, input: str | None, stride_in: str | None, path: Path) -> dict:
-    """Origin, strides, epsilon and input: what the file says, or what is given, or what is usual under its names."""
+    """Returns origin, strides, epsilon and input: what the file says, or what is given, or what is usual under its
+    names.
+    """
     naming, notes = network.naming, file.notes
     if notes:
         require(input in (None, "torch"), "input", input, "left out: the file is one of travjax weights, for torch")
@@ -139,14 +141,14 @@ def _variables(resnet: ResNet) -> dict[str, nnx.Variable]:
 
 @lru_cache
 def _shapes(config: ResNetConfig) -> dict[str, tuple[int, ...]]:
-    """Canonical names and shapes of a network's arrays, with those of the top layer."""
+    """Returns canonical names and shapes of a network's arrays, with those of the top layer."""
     resnet = nnx.eval_shape(lambda: ResNet(config, rngs=nnx.Rngs(key_of(0))))
     shapes = {name: variable.shape for name, variable in _variables(resnet).items()}
     return shapes | {"fc1000/kernel": (config.features, CLASSES), "fc1000/bias": (CLASSES,)}
 
 
 def _read(found: dict[str, Stored], network: Recognised, config: ResNetConfig) -> dict[str, np.ndarray]:
-    """The network's arrays, float32, by canonical name; raises InputError that names whatever does not fit.
+    """Reads the network's arrays, float32, by canonical name; raises InputError that names whatever does not fit.
 
     Only what has the right shape is read, so nothing takes more memory than the network.
     """
@@ -234,7 +236,7 @@ def save_safetensors(weights: Weights, path: str | Path) -> None:
 
 
 def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:
-    """A file of the Hugging Face hub, from its cache if it was fetched before.
+    """Fetches a file of the Hugging Face hub, from its cache if it was fetched before.
 
     Raises InputError when it cannot be fetched.
     """
@@ -251,7 +253,7 @@ def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:
 
 
 def describe(weights: Weights) -> str:
-    """A table of what was found."""
+    """Makes a table of what was found."""
     kernels = [array for name, array in weights.arrays.items() if name.endswith("/kernel")]
     zero = sum(int((kernel == 0).sum()) for kernel in kernels) / sum(kernel.size for kernel in kernels)
     rows = {
@@ -273,14 +275,14 @@ def describe(weights: Weights) -> str:
 
 
 def _statistics(arrays: dict[str, np.ndarray]) -> str:
-    """What the running means and variances are."""
+    """Says what the running means and variances are."""
     if has_statistics(arrays):
         return "measured"
     return "0 and 1: " + ("a network before training" if is_untrained(arrays) else "none, gamma and beta hold them")
 
 
 def _left_out(weights: Weights) -> str:
-    """The first arrays that are none of the network's; most are not read at all."""
+    """Names the first arrays that are not the network's; most are not read at all."""
     names = weights.left_out
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{', '.join(names[:SHOWN])}{more}; only the trunk is needed" if names else "nothing"

@@ -65,13 +65,15 @@ class Checkpoints:
         self._save(f"step-{step}{'-best' if best else ''}", state, meta)
 
     def save_named(self, name: str, state: PyTree, meta: dict) -> None:
-        """Like `save`, but it counts neither as latest nor as best, and replaces the one of the same name."""
+        """Saves as `save` does; the checkpoint counts neither as latest nor as best, and replaces one of the same
+        name.
+        """
         allowed = re.fullmatch(NAME, name) is not None and name not in ("latest", "best")
         require(allowed, "name", name, "lower-case letters, digits and _, neither latest nor best")
         self._save(name, state, meta)
 
     def restore(self, template: PyTree = None, which: str = "latest") -> tuple[PyTree, dict]:
-        """The state and the meta of the latest, the best or a named checkpoint.
+        """Returns the state and the meta of the latest, the best or a named checkpoint.
 
         template: pytree of arrays or `jax.ShapeDtypeStruct` of the same structure, dtypes and shapes, whose shardings
             are taken over (a NumPy array where there is none); or a function that gives it for the checkpoint's meta.
@@ -161,7 +163,7 @@ class Checkpoints:
 
 
 def load_meta(folder: str | Path, which: str = "latest") -> dict:
-    """The meta of a checkpoint alone: its arrays are neither read nor checked, and Orbax is not imported.
+    """Reads the meta of a checkpoint alone: its arrays are neither read nor checked, and Orbax is not imported.
 
     Raises InputError like `Checkpoints.restore`.
     """
@@ -169,13 +171,13 @@ def load_meta(folder: str | Path, which: str = "latest") -> dict:
 
 
 def _checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
-    """Number, kind (latest, best or a name) and path of the checkpoints, newest first."""
+    """Returns number, kind (latest, best or a name) and path of the checkpoints, newest first."""
     matches = [(FOLDER.fullmatch(path.name), path) for path in folder.iterdir()]
     return sorted(((int(m[1]), "best" if m[2] else m[3] or "latest", path) for m, path in matches if m), reverse=True)
 
 
 def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: bool) -> tuple[Path, dict]:
-    """The checkpoint to use and what its meta.json holds; those passed over are added to `damaged`, with the reason.
+    """Returns the checkpoint to use and its meta.json; those passed over are added to `damaged`, with the reason.
 
     The latest ones stand in for damaged best ones.
     """
@@ -209,7 +211,7 @@ class _Unreadable(Exception):
 
 
 def _checked(path: Path, arrays: bool) -> dict:
-    """What meta.json holds, once the files (without `arrays`: meta.json alone) are those of SHA256SUMS, else _Damaged.
+    """Reads meta.json once the files (without `arrays`: it alone) are those of SHA256SUMS; raises _Damaged otherwise.
 
     Raises InputError for another format version.
     """
@@ -232,14 +234,16 @@ def _checked(path: Path, arrays: bool) -> dict:
 
 
 def _files(path: Path) -> dict[str, Path]:
-    """The files by path, but hidden ones, which Finder, NFS and the like leave there and Orbax does not read."""
+    """Returns the files by path, but hidden ones, which Finder, NFS and the like leave there and Orbax does not
+    read.
+    """
     files = sorted(file for file in path.rglob("*") if not file.is_dir() and file.name != "SHA256SUMS")
     named = {file.relative_to(path).as_posix(): file for file in files}
     return {name: file for name, file in named.items() if not f"/{name}".count("/.")}
 
 
 def _named_leaves(tree: PyTree) -> dict[str, Any]:
-    """The leaves by path: trunk/conv1/kernel."""
+    """Returns the leaves by path: trunk/conv1/kernel."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     if len(named) != len(leaves) or not named:
@@ -248,7 +252,9 @@ def _named_leaves(tree: PyTree) -> dict[str, Any]:
 
 
 def _described(leaves: dict[str, Any]) -> dict[str, list]:
-    """Dtype and shape of arrays. Raises InputError for what Orbax cannot hold; it would hang on an empty array."""
+    """Returns dtype and shape of arrays. Raises InputError for what Orbax cannot hold; it would hang on an empty
+    array.
+    """
     for name, leaf in leaves.items():
         numbers = hasattr(leaf, "dtype") and not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended)
         require(numbers and 0 not in leaf.shape, name, leaf, "an array of numbers that is not empty")
@@ -303,7 +309,9 @@ def _require_room(folder: Path, size: int) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """One line. TensorStore reports a full disk and the like as a ValueError that holds the system's error number."""
+    """Puts an error into one line. TensorStore reports a full disk and the like as a ValueError that holds the system's
+    error number.
+    """
     if isinstance(error, OSError):
         return error.strerror or str(error)
     if code := re.search(r"os_error_code='(\d+)'", str(error)):

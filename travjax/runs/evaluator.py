@@ -48,7 +48,7 @@ class Evaluator:
         return Evaluator(run, dataset, devices.replicate(source), devices)
 
     def samples(self, maps: int, each: int) -> Samples:
-        """Random test samples at natural frequency: of so many maps so many trajectories; 0 for all.
+        """Draws test samples at natural frequency: so many trajectories of so many maps; 0 for all.
 
         Raises InputError when there is none.
         """
@@ -62,7 +62,7 @@ class Evaluator:
         return samples
 
     def failed(self, samples: Samples) -> np.ndarray:
-        """Failures of samples: [k, events] bool."""
+        """Returns the failures of samples: [k, events] bool."""
         return np.asarray(unpacked(self.dataset.labels[samples], self.run.robot)[0])
 
     def probabilities(
@@ -94,7 +94,7 @@ class Evaluator:
         return np.minimum(margins[place, samples[1]], largest), np.minimum(true, largest)
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
-        """Test maps, of one group or all, for a figure; first those that fail neither nowhere nor everywhere."""
+        """Returns test maps, of one group or all, for a figure; those that fail in part come first."""
         data = self.dataset
         test = data.maps_of("test")
         test = test if group is None else test[data.group[test] == group]
@@ -104,13 +104,13 @@ class Evaluator:
     def whole_maps(
         self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None, every: int = 1
     ) -> np.ndarray:
-        """Probabilities of all trajectories of maps [k], or of every so many: [k, t, 3]."""
+        """Returns the probabilities of all trajectories of maps [k], or of every so many: [k, t, events]."""
         trajectories = np.arange(0, len(self.run.actions), every)
         samples = (np.repeat(maps, len(trajectories)), np.tile(trajectories, len(maps)))
         return self.probabilities(estimator, samples, on_progress).reshape(len(maps), len(trajectories), -1)
 
     def every(self, maps: int, samples: int) -> int:
-        """Every how many trajectories of so many maps to show, so that a figure takes no longer than `samples` do.
+        """Returns the step between the trajectories to show, so that a figure takes no longer than `samples` do.
 
         At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. Where whole maps are
         read at once, all are shown.
@@ -121,7 +121,7 @@ class Evaluator:
         return next(number for number in range(most, 0, -1) if math.gcd(number, len(self.run.actions.radii)) == 1)
 
     def regression(self, samples: Samples) -> np.ndarray:
-        """Probabilities of samples by the baseline's regression, fitted to training maps: [k, events]."""
+        """Returns the probabilities of samples by the baseline's regression, fitted to training maps: [k, events]."""
         config, run, heights = self.run.preset.training, self.run, self.dataset.heights
         maps = self.dataset.maps_of("train")[: max(1, REGRESSION_SAMPLES // config.trajectories_per_map)]
         each, failing = config.trajectories_per_map, config.failing_per_map
@@ -136,7 +136,7 @@ class Evaluator:
         return metrics.PAPER_SYNTHETIC if compares else None
 
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
-        """All figures of predicted probabilities [k, events], by style or site as well."""
+        """Returns all scores of predicted probabilities [k, events], by style or site as well."""
         groups = self.dataset.group[samples[0]]
         return metrics.evaluate(
             probability,

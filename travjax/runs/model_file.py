@@ -28,7 +28,7 @@ def write_model(path: Path, run: Run, network: Network, notes: dict) -> None:
 
 
 def read_model(path: Path) -> tuple[Run, Network, dict]:
-    """The run, the estimator and the notes of a file.
+    """Reads the run, the estimator and the notes of a file.
 
     A file of an older version has no checksums, which is said in a line.
     Raises InputError when it is missing, damaged or something else, or a number of it is not finite.
@@ -47,7 +47,7 @@ def read_model(path: Path) -> tuple[Run, Network, dict]:
 
 
 def _described(notes: dict, path: Path) -> tuple[Run, dict]:
-    """The run and the notes that write_model was given."""
+    """Returns the run and the notes that write_model was given."""
     try:
         if notes.keys() == {"run", "notes"} and isinstance(notes["notes"], dict):
             return Run.from_json(notes["run"], path), notes["notes"]
@@ -59,7 +59,7 @@ def _described(notes: dict, path: Path) -> tuple[Run, dict]:
 
 
 def _read(file: WeightFile, leaves: dict[str, jax.ShapeDtypeStruct]) -> list[np.ndarray]:
-    """The arrays of an estimator's leaves, in their order."""
+    """Reads the arrays of an estimator's leaves, in their order."""
     expected = {name: (leaf.shape, leaf.dtype.name) for name, leaf in leaves.items()}
     given = {name: (stored.shape, stored.dtype) for name, stored in file.arrays.items()}
     if expected != given:

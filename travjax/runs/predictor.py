@@ -56,7 +56,7 @@ class Predictor:
     @staticmethod
     @usual_flags()
     def load(source: str | Path | None = None, which: str = "best") -> "Predictor":
-        """The estimator of a file, of a training run's folder, or the one that comes with the package.
+        """Loads the estimator of a file, of a training run's folder, or the one that comes with the package.
 
         which: checkpoint of a folder
         Raises InputError when there is none, or it is damaged.
@@ -82,9 +82,9 @@ class Predictor:
 
     @usual_flags()
     def predict(self, heights: Heights, on_progress: Progress = lambda count: None) -> Predicted:
-        """Of maps [n, rows, cols] or [rows, cols] metres, NaN unknown, on the run's grid; heights as `simulate` takes
-        them.
+        """Predicts the failures of every trajectory of maps on the run's grid.
 
+        heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, as `simulate` takes them
         An unknown node counts as the nearest known one to the hazard field, and as in SPEC section 6 to the ResNet.
         on_progress: is told how many trajectories were added
         Raises InputError when `simulate` would over the heights, and when the estimator puts out NaN or infinity.
@@ -108,7 +108,7 @@ class Predictor:
 
 
 def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t k"]:
-    """Probabilities of step, obstacle and tilt failures for every trajectory of every map.
+    """Returns the probabilities of step, obstacle and tilt failures for every trajectory of every map.
 
     heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model is for others
     model:   folder of a training run, or .safetensors file; the hazard field for the Seekur Jr that comes with the

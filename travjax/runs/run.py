@@ -52,12 +52,14 @@ class Run:
         return save_text(folder / "run.json", json.dumps(self.to_json(), indent=1) + "\n")
 
     def to_json(self) -> dict[str, Any]:
-        """What JSON can hold."""
+        """Converts the run to what JSON can hold."""
         return {name: to_json(getattr(self, name)) for name in _PARTS}
 
     @staticmethod
     def from_json(table: Any, where: object = "saved settings") -> "Run":
-        """The inverse of `to_json`; prints which keys of `where` are old, and raises InputError over another table."""
+        """Restores what `to_json` gave; prints which keys of `where` are old, and raises InputError over another
+        table.
+        """
         return Run(**parts_from_json(table, _PARTS, where))
 
     @staticmethod
@@ -96,7 +98,7 @@ class Run:
 
     @usual_flags()
     def graph(self) -> nnx.GraphDef:
-        """What is fixed of the estimator."""
+        """Returns what is fixed of the estimator."""
         return split_model(nnx.eval_shape(self.create))[0]
 
     @usual_flags()
@@ -129,7 +131,7 @@ def _settings(mine: Any, other: Any, prefix: str = ""):
 
 
 def has_checkpoints(folder: Path) -> bool:
-    """Whether training has begun in the folder: it holds a checkpoint, whole or not."""
+    """Tells whether training has begun in the folder: it holds a checkpoint, whole or not."""
     checkpoints = folder / "checkpoints"
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
@@ -159,7 +161,7 @@ def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict
 
 @usual_flags()
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
-    """The run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
+    """Loads the run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
     Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or a
@@ -177,6 +179,6 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
 
 
 def named_leaves(variables: Any) -> dict[str, Any]:
-    """The leaves of an estimator's variables by path, in their order: "trunk/trunk/stem/kernel"."""
+    """Returns the leaves of an estimator's variables by path, in their order: "trunk/trunk/stem/kernel"."""
     name = lambda path: jax.tree_util.keystr(path, simple=True, separator="/").removesuffix("/value")
     return {name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}

@@ -86,7 +86,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
-    """The row of a line; None where it is none."""
+    """Parses the row of a line; None where it is none."""
     try:
         row = parse_json(line.decode(), "row")
     except (UnicodeDecodeError, InputError):

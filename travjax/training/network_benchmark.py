@@ -77,7 +77,7 @@ class Bench:
         yield self.all_trajectories()
 
     def inputs(self) -> dict:
-        """A batch from the drawing of its samples to the images and labels on the device."""
+        """Makes a batch, from the drawing of its samples to the images and labels on the device."""
         epochs = iter(range(10**9))
 
         def batch():
@@ -90,7 +90,7 @@ class Bench:
         return self._timed("inputs of a batch, a fresh subset of 64 maps included", BATCH, batch)
 
     def training_step(self) -> dict:
-        """Everything trained, from sample indices to new parameters."""
+        """Makes a training step, from sample indices to new parameters."""
         phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().make_optimizer(2, 1)
         settings = StepSettings(self.graph, phase, optimizer, penalty=0.001)
         trained = {name: self.variables[name] for name in phase.trained}
@@ -109,11 +109,11 @@ class Bench:
         return self._timed(FLAX, STEP_BATCH, step)
 
     def torch_step(self) -> dict:
-        """The same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
+        """Makes the same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
         return self._timed(TORCH, STEP_BATCH, _torch_training(self.dataset.grid))
 
     def all_trajectories(self, batch: int = BATCH, repeats: int = 1) -> dict:
-        """All trajectories of one map through the network, so many at once."""
+        """Runs all trajectories of one map through the network, so many at once."""
         count = len(self.dataset.actions)
         samples = (np.zeros(count, np.int32), np.arange(count, dtype=np.int32))
         variables = self.devices.replicate({name: self.variables[name] for name in VARIABLES})

@@ -167,7 +167,7 @@ class Trainer:
                 self.log.close()
 
     def _begin(self, phase: int) -> None:
-        """A new optimizer, for what the phase trains."""
+        """Begins a phase with a new optimizer, for what it trains."""
         self.position.phase, self.position.epoch = phase, 0
         self.__dict__.pop("features", None)  # gigabytes for a large data set
         if not self.phase.frozen_trunk:
@@ -182,7 +182,7 @@ class Trainer:
         return {name: self.state[name] for name in VARIABLES}
 
     def _planned_steps(self, phase: int) -> int:
-        """Steps of a phase; with fresh samples an epoch may have one more or less."""
+        """Counts the steps of a phase; with samples drawn anew an epoch may have one more or less."""
         return self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
@@ -191,7 +191,7 @@ class Trainer:
         return self._optimizers[phase]
 
     def _train_epoch(self) -> None:
-        """From the present step to the end of the epoch, its validation and its checkpoint."""
+        """Trains from the present step to the end of the epoch, its validation and its checkpoint."""
         here, data = self.position, self.data
         steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
         began = time.perf_counter()
@@ -268,7 +268,7 @@ class Trainer:
         }
 
     def _watched(self) -> dict[str, Any]:
-        """Confusion and average precision of each event, and overall, on the samples of `eval_sets`."""
+        """Returns confusion and average precision of each event, and overall, on the samples of `eval_sets`."""
         names = [name for name in self.scored if name != "validation"]
         failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
         events = self.run.robot.event_names
@@ -289,7 +289,7 @@ class Trainer:
         raise self._diverged(f"a {name} logit that is no number", self.position.step)
 
     def summary(self) -> str:
-        """One line: what is trained on what."""
+        """Says in one line what is trained on what."""
         run, device = self.run, jax.devices()[0].device_kind
         return (
             f"{run.robot.name}, {len(run.actions)} trajectories a map; {self.data.summary()}; first weights: "
@@ -302,7 +302,7 @@ class Trainer:
             return function(placed, samples, self.config.batch_size, bar.update)
 
     def _meta(self, optimizer: int) -> dict[str, Any]:
-        """What a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
+        """Returns what a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
         return {
             "position": asdict(self.position),
             "optimizer": optimizer,
