@@ -75,12 +75,12 @@ class TransferConfig:
 
     @property
     def frozen(self) -> bool:
-        """Whether the trunks are."""
+        """Whether the trunks stay frozen."""
         return self.training.head_epochs > 0
 
     @property
     def epochs(self) -> int:
-        """Of each run."""
+        """The number of epochs of each run."""
         return self.training.head_epochs or self.training.epochs
 
 
