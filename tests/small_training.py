@@ -164,7 +164,7 @@ def rows_of(folder: Path) -> list[dict]:
     """The rows of metrics.jsonl without the one number that depends on the time."""
     rows = read_rows(folder / "metrics.jsonl")
     for row in rows:
-        assert row["epoch"] == 0 or row.pop("samples_per_s") >= 0  # 0: the first state, watched samples alone
+        assert row["epoch"] == 0 or row.pop("samples_per_s") >= 0  # 0: the first state, eval sets alone
     return rows
 
 

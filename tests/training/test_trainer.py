@@ -115,7 +115,7 @@ def numpy_step(heads: dict, nu: dict, features, failed, weight, rate: float, dec
 
 def test_steps_of_the_heads_are_those_of_numpy():
     made = create(PRESET.trunk, HeadsConfig(5, dropout=0.0), seed=3)
-    optimizer = replace(PRESET.training, learning_rate=0.01).optimizer(1, 1)
+    optimizer = replace(PRESET.training, learning_rate=0.01).make_optimizer(1, 1)
     settings, state = StepSettings(split_model(made)[0], PHASES[1], optimizer, 0.05), state_of(made, 1, optimizer)
     heads = {name: array.astype(np.float64) for name, array in host(state["heads"]["heads"]).items()}
     nu = {name: np.zeros_like(array) for name, array in heads.items()}
@@ -174,7 +174,7 @@ def trainer_samples(count: int = 32):
 
 def test_a_narrow_trunk_learns_32_samples_by_heart():
     made = create(replace(PRESET.trunk, width=8), HeadsConfig(16, dropout=0.0))
-    optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").optimizer(2, 150)
+    optimizer = replace(PRESET.training, learning_rate=3e-3, schedule="cosine").make_optimizer(2, 150)
     graph, state = split_model(made)[0], state_of(made, 2, optimizer)
     samples = trainer_samples(32)
     failed = failed_of(samples).astype(np.float32)
@@ -247,7 +247,7 @@ def eval_sets() -> dict[str, tuple]:
 
 
 @pytest.mark.parametrize("phases", [{"head_epochs": 2, "epochs": 0}, {"head_epochs": 0, "epochs": 2}])
-def test_watched_samples_are_scored_before_training_and_after_each_epoch(tmp_path, phases):
+def test_eval_sets_are_scored_before_training_and_after_each_epoch(tmp_path, phases):
     made = Trainer(run_of(**phases), dataset(), tmp_path, Devices.all(), quiet=True, eval_sets=eval_sets())
     made.start(create(PRESET.trunk, PRESET.heads, 0))
     states = [host(made._variables)]
@@ -266,7 +266,7 @@ def test_watched_samples_are_scored_before_training_and_after_each_epoch(tmp_pat
                 assert row["eval_sets"][name][event]["confusion"] == metrics.json_ready(counts)
 
 
-def test_training_does_not_depend_on_watched_samples(tmp_path):
+def test_training_does_not_depend_on_eval_sets(tmp_path):
     begun(tmp_path / "without").train()
     made = Trainer(run_of(), dataset(), tmp_path / "with", Devices.all(), quiet=True, eval_sets=eval_sets())
     (tmp_path / "with").mkdir()

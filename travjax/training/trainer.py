@@ -152,7 +152,7 @@ class Trainer:
         if self.devices.main:
             self.log = RunLog(self.folder, self.position.total)
         try:
-            if not self.position.total and (row := self._watched()) and self.log:
+            if not self.position.total and (row := self._eval_scores()) and self.log:
                 self.log.write({"step": 0, "phase": self.position.phase, "epoch": 0} | row)
             while self.position.phase == 1:
                 if self.position.epoch == self.config.head_epochs:
@@ -245,7 +245,7 @@ class Trainer:
 
     def _finish_epoch(self, rate: float) -> None:
         here = self.position
-        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated(), **self._watched()}
+        row = {"loss": here.loss / here.samples, "samples_per_s": rate, **self._validated(), **self._eval_scores()}
         overall = row["average_precision"]["overall"] or 0.0
         best, here.best = overall > here.best, max(here.best, overall)
         self._report(row)
@@ -267,7 +267,7 @@ class Trainer:
             "f1": metrics.json_ready(scores.f1),
         }
 
-    def _watched(self) -> dict[str, Any]:
+    def _eval_scores(self) -> dict[str, Any]:
         """Returns confusion and average precision of each event, and overall, on the samples of `eval_sets`."""
         names = [name for name in self.scored if name != "validation"]
         failed = {name: self.data.failed(self.scored[name]).astype(bool) for name in names}
