@@ -45,12 +45,12 @@ def within(ax, image: np.ndarray) -> np.ndarray:
 
 
 def count_of(image: np.ndarray, name: str) -> int:
-    """How many pixels are clearly green (safe) or red (failed)."""
+    """Counts pixels that are clearly blue (safe) or red (failed)."""
     red, green, blue = np.moveaxis(image, -1, 0)
     return int(
         {
             "failed": (red > green + 60) & (red > blue + 60),
-            "safe": (green > red + 30) & (green > blue + 30),
+            "safe": (blue > red + 30) & (blue > green),
         }[name].sum()
     )
 
