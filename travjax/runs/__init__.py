@@ -1,4 +1,4 @@
-"""A training run on disk and its use.
+"""A training run on disk, and what it is used for.
 
 In: a preset, the folder of a run or a file of a model. Out: checkpoints, the run's estimator, its predictions and
 scores, its model card.

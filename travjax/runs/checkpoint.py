@@ -1,13 +1,13 @@
-"""Checkpoints of training, written by Orbax: whole or not at all, checked when they are read.
+"""Training checkpoints, which Orbax writes whole or not at all; they are checked when they are read.
 
-A folder holds one sub-folder a checkpoint, numbered in the order they were saved:
+A folder holds one sub-folder for each checkpoint, numbered in the order in which they were saved:
 
     000007-step-1200-best/   state/       the arrays, in Orbax's format
                              meta.json    what the caller says of the checkpoint, and dtype and shape of its arrays
                              SHA256SUMS   of every other file, written last; `sha256sum -c SHA256SUMS` reads it too
-    000008-heads/            one that was saved under a name
+    000008-heads/            a checkpoint that was saved under a name
 
-A checkpoint is written to a temporary folder and renamed: a kill at any moment leaves the earlier ones as they were.
+A checkpoint is written to a temporary folder and renamed: if the process is killed, the earlier ones stay as they were.
 """
 
 import errno
@@ -33,10 +33,10 @@ from travjax.runs.quiet_orbax import quiet_orbax
 FORMAT = 1
 UNFINISHED = ".unfinished-checkpoint"
 ENTRIES = 64
-"""Files and folders for which there must be room, a few more than a checkpoint has."""
+"""Number of files and folders there must be room for, a few more than a checkpoint has."""
 
 SPARE = 2**20
-"""Bytes for which there must be room beside those of the arrays."""
+"""Bytes there must be room for in addition to the arrays."""
 
 NAME = "[a-z][a-z0-9_]*"
 FOLDER = re.compile(rf"(\d{{6,}})-(?:step-\d+(-best)?|({NAME}))")
@@ -76,11 +76,11 @@ class Checkpoints:
         """Returns the state and the meta of the latest, the best or a named checkpoint.
 
         template: pytree of arrays or `jax.ShapeDtypeStruct` of the same structure, dtypes and shapes, whose shardings
-            are taken over (a NumPy array where there is none); or a function that gives it for the checkpoint's meta.
-            Without a template: nested dicts of NumPy arrays
-        A damaged checkpoint is passed over for the one before it, with a notice; one that training removes meanwhile,
-        for the newer one.
-        Raises InputError when none is good, or the template's arrays are others.
+            are used (a NumPy array where there is none); or a function that makes it from the checkpoint's meta.
+            Without a template it returns nested dicts of NumPy arrays
+        A damaged checkpoint is skipped in favour of the one before it, with a notice; one that training removes
+        meanwhile, in favour of the newer one.
+        Raises InputError when none is intact, or when its arrays differ from the template's.
         """
         while True:
             path, saved = self._newest_good(which)
@@ -138,7 +138,7 @@ class Checkpoints:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
     def _together(self, work: Callable[[], None], mine: bool) -> None:
-        """Does the work if it is mine and waits for the other processes; raises in all if it failed in one."""
+        """Does the work if it is mine and waits for the other processes; raises in all of them if one failed."""
         reason = ""
         try:
             if mine:
@@ -158,7 +158,7 @@ class Checkpoints:
         latest = [path for kind, path in good if kind in ("latest", "best")][: self.keep_latest]
         for _, _, path in _checkpoints(self.folder):
             if path not in newest and path not in latest:
-                unfinished = path.rename(self.folder / UNFINISHED)  # so that no half of it is left as a checkpoint
+                unfinished = path.rename(self.folder / UNFINISHED)  # so that no half-deleted checkpoint remains
                 shutil.rmtree(unfinished, ignore_errors=True)
 
 
@@ -179,7 +179,7 @@ def _checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
 def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: bool) -> tuple[Path, dict]:
     """Returns the checkpoint to use and its meta.json; those passed over are added to `damaged`, with the reason.
 
-    The latest ones stand in for damaged best ones.
+    A latest checkpoint stands in for a damaged best one.
     """
     try:
         found = _checkpoints(folder)
@@ -194,7 +194,9 @@ def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: boo
         try:
             return path, _checked(path, arrays)
         except _Damaged as error:
-            if _checkpoints(folder) != found:  # training goes on there, and may have removed it for a newer one
+            if (
+                _checkpoints(folder) != found
+            ):  # training is still running there, and may have replaced it by a newer one
                 damaged.clear()
                 return _newest_good(folder, which, damaged, arrays)
             damaged[path] = str(error)
@@ -275,7 +277,7 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
             arrays = ocp.load(path / "state", abstract)
     except MemoryError:
         raise
-    except Exception as error:  # Orbax and TensorStore raise whatever their parsers do; the checksums were in order
+    except Exception as error:  # Orbax and TensorStore raise whatever their parsers do, although the checksums match
         reason = textwrap.shorten(_reason(error), 80, placeholder=" ...")
         raise _Unreadable(f"state: cannot be read: {reason}") from None
     if template is None:
@@ -284,7 +286,7 @@ def _load(path: Path, saved: dict[str, list], template: PyTree) -> PyTree:
 
 
 def _require_same_arrays(path: Path, saved: dict[str, list], wanted: dict[str, list]) -> None:
-    """Raises InputError that names the first arrays of a checkpoint that are not those wanted."""
+    """Raises InputError that names the first arrays of a checkpoint that differ from those wanted."""
     shown = lambda array: "{}{}".format(*array) if array else "missing"
     names = [name for name in {**wanted, **saved} if saved.get(name) != wanted.get(name)]
     if names:
@@ -294,7 +296,7 @@ def _require_same_arrays(path: Path, saved: dict[str, list], wanted: dict[str, l
 
 
 def _require_room(folder: Path, size: int) -> None:
-    """Raises OSError where a checkpoint of so many bytes has no room: Orbax finds out late, and may hang then."""
+    """Raises OSError where a checkpoint of `size` bytes has no room: Orbax notices late, and may then hang."""
     places = [folder / f"room-{number}" for number in range(ENTRIES)]
     for place in places:
         place.touch()
@@ -303,7 +305,7 @@ def _require_room(folder: Path, size: int) -> None:
             os.posix_fallocate(file.fileno(), 0, size + SPARE)
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            raise  # else it is one file of that size that cannot be
+            raise  # otherwise a single file of that size is not allowed
     for place in places:
         place.unlink()
 

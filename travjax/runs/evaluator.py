@@ -20,10 +20,10 @@ from travjax.runs.run import Run
 from travjax.simulation.traverse import as_in_paper, simulate, unpacked
 
 SPARSEST = 6
-"""A figure shows every sixth trajectory at least."""
+"""A figure shows at least every sixth trajectory."""
 
 REGRESSION_SAMPLES = 50_000
-"""Training samples that the logistic regression is fitted to, at most."""
+"""Most training samples that the logistic regression is fitted to."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Evaluator:
 
     @staticmethod
     def from_run(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
-        """Puts the images' parts on the devices."""
+        """Puts the network's source, made from the maps, on the devices."""
         require_matching(dataset, run.robot, run.actions, run.grid)
         devices.check_batch(run.preset.training.batch_size)
         source = run.source(dataset.heights)
@@ -50,7 +50,7 @@ class Evaluator:
     def samples(self, maps: int, each: int) -> Samples:
         """Draws test samples at natural frequency: so many trajectories of so many maps; 0 for all.
 
-        Raises InputError when there is none.
+        Raises InputError when there are none.
         """
         labels, test = self.dataset.labels, self.dataset.maps_of("test")
         if maps or each:
@@ -78,8 +78,9 @@ class Evaluator:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Returns predicted and true margins of samples, [k, events] each, in units of the robot's limits.
 
-        For estimators that have margins. Both are cut off at the kind's largest margin. on_progress: is told of maps
-        Raises InputError when the data set says of a trajectory that it is known and its map says that it is not.
+        Only for estimators that have margins. Both are clipped at the kind's largest margin.
+        on_progress: is called with numbers of maps
+        Raises InputError when the data set marks a trajectory as known whose margins on its map are unknown.
         """
         maps, place = np.unique(samples[0], return_inverse=True)
         run, count = self.run, len(self.run.actions)
@@ -131,7 +132,7 @@ class Evaluator:
 
     @property
     def paper(self) -> Mapping[str, metrics.Confusion] | None:
-        """The paper's confusion matrices, if they compare: synthetic maps, its robot and its action space."""
+        """The paper's confusion matrices; None unless maps are synthetic and robot and action space are the paper's."""
         compares = self.dataset.config and as_in_paper(self.run.robot, self.run.actions)
         return metrics.PAPER_SYNTHETIC if compares else None
 

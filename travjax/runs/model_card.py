@@ -1,4 +1,4 @@
-"""The file of a run's estimator with its model card: what it was trained on, and how good it is."""
+"""Exports a run's estimator to a file with a model card: what it was trained on, and how good it is."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ PURPOSE = (
 def export_run(folder: str | Path, to: str | Path, checkpoint: str = "best") -> tuple[Path, Path]:
     """Writes the estimator of a training run to one file, and a model card beside it; returns where both are.
 
-    to: .safetensors file; no file of another kind is replaced
+    to: .safetensors file; a file that travjax did not write is never replaced
     Raises InputError when the run or its checkpoint is missing or damaged, and when something else is in the way.
     """
     run, path = user_path(folder), user_path(to)
@@ -55,12 +55,12 @@ def _text(path: Path) -> str | None:
 
 
 def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | None) -> str:
-    """Returns a card: what the estimator is for, how it was made, how good it is, and where a field is worth using.
+    """Returns a model card: what the estimator is for, how it was made, and how good it is.
 
-    notes:  of the model file
-    name:   of the model file
-    tables: of `travjax evaluate`, if it was run
-    real:   the table of real ground of the comparison, if it was run
+    notes:  the notes of the model file
+    name:   the name of the model file
+    tables: the tables of `travjax evaluate`, if it was run
+    real:   the comparison's table for real ground, if it was run
     """
     preset, grid = trained.preset, trained.grid
     seen, field = preset.corruption, trained.kind.reads_whole_maps
@@ -96,7 +96,7 @@ Limits: labels are those of a kinematic simulator on synthetic terrain, without 
 
 
 def _beside_simulator(table: str | None) -> str:
-    """Writes the section on where a hazard field is worth using, as the simulator takes the same maps."""
+    """Writes the section that compares a hazard field with the simulator, which takes the same maps."""
     command = "python -m travjax.experiments.comparison --ground real --field RUN --out RUN/comparison"
     measured = f"```\n{table}\n```" if table else f"Not measured: `{command}` does it; `--sites` takes ground of yours."
     return f"""

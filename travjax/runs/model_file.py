@@ -1,7 +1,7 @@
 """A trained estimator as one file: a .safetensors of its variables, with what it was made from and how good it is.
 
 The estimators that come with the package are such files (weights/). Checksums of all of it are in the header
-(resnet/weight_files.py) and are compared when it is read: a damaged estimator predicts nothing.
+(resnet/weight_files.py) and are compared when it is read, so a damaged estimator is refused.
 """
 
 from pathlib import Path
@@ -19,9 +19,9 @@ SUFFIX = ".safetensors"
 
 
 def write_model(path: Path, run: Run, network: Network, notes: dict) -> None:
-    """Writes an estimator; notes: what JSON can hold, on its training and its figures.
+    """Writes an estimator; notes: JSON values that describe its training and its scores.
 
-    Raises InputError that names an array of which a number is not finite.
+    Raises InputError that names an array with a number that is not finite.
     """
     arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(split_model(network)[1]).items()}
     write_safetensors(path, arrays, {"run": run.to_json(), "notes": notes})
@@ -30,8 +30,8 @@ def write_model(path: Path, run: Run, network: Network, notes: dict) -> None:
 def read_model(path: Path) -> tuple[Run, Network, dict]:
     """Reads the run, the estimator and the notes of a file.
 
-    A file of an older version has no checksums, which is said in a line.
-    Raises InputError when it is missing, damaged or something else, or a number of it is not finite.
+    A file of an older version has no checksums; a printed line says so.
+    Raises InputError when it is missing, damaged or something else, or holds a number that is not finite.
     """
     try:
         with open_arrays(path) as file:

@@ -12,13 +12,13 @@ from travjax.runs.predictor import Predictor
 from travjax.simulation.setup import setup_json
 
 PROBABILITY = 0.5
-"""From which a trajectory counts as failing in the printed table."""
+"""Probability from which a trajectory counts as failing in the printed table."""
 
 SIMULATOR = "simulator\non the map as given"
-"""What a figure calls the row below the predictions."""
+"""Label of the row below the predictions in a figure."""
 
 AGAINST = "Against the simulator on the map as given, its noise included"
-"""What stands above the table of `--check`."""
+"""Heading of the table that `--check` prints."""
 
 
 def predict_maps(
@@ -26,7 +26,7 @@ def predict_maps(
 ) -> Path:
     """Predicts failures on maps, prints the shares that fail, and writes predictions, shares and a figure.
 
-    check: whether the simulator stands beside the predictions, on the maps as given
+    check: whether to compare the predictions with the simulator on the maps as given
     Returns the .npz of the predictions. Raises InputError when they do not fit on the disk, or cannot be written.
     """
     folder, trained = output_folder(out), predictor.run
@@ -54,7 +54,7 @@ def predict_maps(
 
 
 def _predicted(batch: Batch, predictor: Predictor, on_progress: Callable[[int], object]) -> Batch:
-    """Adds to a batch what is predicted, and what the simulator says: failures, and trajectories on known ground."""
+    """Adds the predictions to a batch, and from the simulator the failures and which trajectories are known."""
     trained = predictor.run
     simulated = labelled(batch, trained.robot, trained.actions, trained.grid)
     predicted = predictor.predict(batch["heights"], on_progress)
@@ -68,14 +68,14 @@ def _predicted(batch: Batch, predictor: Predictor, on_progress: Callable[[int], 
 
 
 def _checked(maps: Batch, events: Sequence[str]) -> str:
-    """Compares predictions with the simulator on the maps as given; on noisy ones that is not what a robot meets."""
+    """Compares predictions with the simulator on the maps as given; on noisy maps that is not the true ground."""
     known = maps["known"]
     scores = metrics.evaluate(maps["probability"][known], maps["failed"][known], events=events)
     return f"{AGAINST}:\n{tables.metrics_table(scores, None)}"
 
 
 def _figure(maps: Batch, predictor: Predictor, check: bool, out: Path) -> Path:
-    """Draws the action space of a few maps in safe, doubtful and failing; `check` adds the simulator's below it."""
+    """Draws which trajectories of a few maps are safe, doubtful or failing; `check` adds a row by the simulator."""
     from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
     shown, trained = samples(maps), predictor.run

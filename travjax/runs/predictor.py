@@ -29,8 +29,8 @@ DEFAULT = "field_seekur_jr"
 class Predicted:
     """What an estimator says of the trajectories of maps.
 
-    probability: [n, t, k] of failures by the robot's events: step, obstacle and tilt unless it has more
-    margins:     [n, t, k] metres or radians; None of an estimator that has none
+    probability: [n, t, k] of each of the robot's failure events: step, obstacle and tilt, and any further ones
+    margins:     [n, t, k] metres or radians; None if the estimator has none
     """
 
     probability: Float[np.ndarray, "*n t k"]
@@ -71,7 +71,9 @@ class Predictor:
     def require_trained_for(
         self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None
     ):
-        """Raises InputError that names both when something else is given than the estimator was trained for."""
+        """Raises InputError when robot, actions or grid differ from what the estimator was trained for; it names
+        both.
+        """
         run = self.run
         if robot:
             same = " of other dimensions or limits" if robot.name == run.robot.name else ""
@@ -85,13 +87,13 @@ class Predictor:
         """Predicts the failures of every trajectory of maps on the run's grid.
 
         heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, as `simulate` takes them
-        An unknown node counts as the nearest known one to the hazard field, and as in SPEC section 6 to the ResNet.
+        The hazard field gives an unknown node the height of the nearest known one; the ResNet follows SPEC section 6.
         on_progress: is told how many trajectories were added
-        Raises InputError when `simulate` would over the heights, and when the estimator puts out NaN or infinity.
+        Raises InputError where `simulate` would refuse the heights, and when the estimator returns NaN or infinity.
         """
         checked, alone = as_maps(heights, self.run.grid)
         maps = np.asarray(checked)
-        maps = np.where(np.abs(maps) <= HIGHEST, maps, np.nan)  # those of a jax array may be anything
+        maps = np.where(np.abs(maps) <= HIGHEST, maps, np.nan)  # a jax array may hold any values
         try:
             logits, margins = self._outputs(maps, on_progress)
         except NoNumbers as error:
@@ -100,7 +102,7 @@ class Predictor:
         return Predicted(one(probabilities(logits)), None if margins is None else one(margins))
 
     def _outputs(self, maps: np.ndarray, on_progress: Progress) -> tuple[np.ndarray, np.ndarray | None]:
-        """Returns logits and margins of the trajectories of maps: [n, t, k] each, no margins where there are none."""
+        """Returns logits and margins of the trajectories of maps: [n, t, k] each, None for margins if it has none."""
         run, devices = self.run, Devices.all()
         placed = Placed.from_network(self.network, devices.replicate(run.source(maps)), devices)
         logits, margins = run.kind.of_maps(placed, np.arange(len(maps)), len(run.actions), on_progress)
@@ -110,10 +112,10 @@ class Predictor:
 def predict(heights: Heights, model: str | Path | None = None) -> Float[np.ndarray, "*n t k"]:
     """Returns the probabilities of step, obstacle and tilt failures for every trajectory of every map.
 
-    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model is for others
+    heights: [n, rows, cols] or [rows, cols] metres, NaN unknown, 8 x 8 m at 0.0625 m unless the model expects others
     model:   folder of a training run, or .safetensors file; the hazard field for the Seekur Jr that comes with the
              package unless given
     Returns [n, t, 3], or [t, 3] for one map; more where the model's robot has further events. Raises InputError for
-    heights or a model that cannot be.
+    invalid heights or an invalid model.
     """
     return Predictor.load(model).predict(heights).probability

@@ -1,4 +1,4 @@
-"""Orbax without what it prints, on event loops that wait for their own tasks and threads."""
+"""Runs Orbax without its printed output, on event loops that wait for their own tasks and threads."""
 
 import asyncio
 import logging
@@ -18,8 +18,8 @@ def _not_from_orbax(record: logging.LogRecord) -> bool:
 class _PatientLoop(asyncio.SelectorEventLoop):
     """An event loop that ends no earlier than its tasks and threads.
 
-    Orbax closes its own at the first error, while others of its reads and writes are under way: they would go on, each
-    would print a traceback, and what is removed would be made again.
+    Orbax closes its own loop at the first error while other reads and writes are still running: they would go on, print
+    a traceback each, and create removed files again.
     """
 
     def close(self) -> None:
@@ -39,7 +39,7 @@ class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
 
 @contextmanager
 def patient_loops() -> Iterator[None]:
-    """Has asyncio make patient loops, and uvloop, whose loops Orbax runs beside, as well."""
+    """Makes asyncio, and uvloop, whose loops Orbax also runs, create patient loops."""
     policy, new_event_loop = asyncio.get_event_loop_policy(), uvloop.new_event_loop
     asyncio.set_event_loop_policy(_PatientPolicy())
     uvloop.new_event_loop = lambda: _PatientLoop()  # type: ignore
@@ -52,7 +52,7 @@ def patient_loops() -> Iterator[None]:
 
 @contextmanager
 def quiet_orbax() -> Iterator[Any]:
-    """Gives Orbax with patient loops, without its warnings and its log; its threads also log each error it raises."""
+    """Provides Orbax with patient loops, and without its warnings and its log, which repeats each error it raises."""
     logging.getLogger("absl").addFilter(_not_from_orbax)  # adding it again changes nothing
     with warnings.catch_warnings(), patient_loops():
         warnings.simplefilter("ignore")

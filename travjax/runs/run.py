@@ -27,10 +27,10 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
 COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
-"""What a checkpoint says of where training stood: whole numbers, and others."""
+"""Fields of the training position that a checkpoint records: whole numbers, and other numbers."""
 
 DATA = "data"
-"""Folder of a run's own data set."""
+"""Name of the folder that holds a run's own data set."""
 
 _PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
 
@@ -39,7 +39,7 @@ _PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid
 class Run:
     """What a training run is made from.
 
-    robot, actions, grid: what the labels, and so the network, hold for
+    robot, actions, grid: those that the labels, and so the network, are made for
     """
 
     preset: Preset
@@ -81,7 +81,7 @@ class Run:
 
     @property
     def kind(self) -> EstimatorKind:
-        """The estimator's kind, which says how it is made, trained and read."""
+        """The estimator's kind, which defines how it is made, trained and read."""
         return ESTIMATORS[self.preset.model].load()
 
     @usual_flags()
@@ -93,7 +93,7 @@ class Run:
         return self.kind.create(self.preset, self.robot, seed, weights)
 
     def source(self, heights: np.ndarray, on_progress: Progress = lambda count: None) -> Any:
-        """Returns maps [n, rows, cols] as the estimator takes them; on_progress is told of trajectories drawn."""
+        """Returns maps [n, rows, cols] in the form the estimator takes; on_progress counts the trajectories drawn."""
         return self.kind.source(self.preset, heights, self.robot, self.actions, self.grid, on_progress)
 
     @usual_flags()
@@ -137,10 +137,10 @@ def has_checkpoints(folder: Path) -> bool:
 
 
 def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict:
-    """Returns what training said of a checkpoint of a run.
+    """Returns the meta that training wrote with a checkpoint of a run, once it is checked.
 
-    Raises InputError that names the run's folder where it did not say it, and run.json where the checkpoint was trained
-    with other settings than those of `run`, if one is given; older checkpoints do not say with which.
+    Raises InputError that names the run's folder where the meta is incomplete, and run.json where the checkpoint was
+    trained with other settings than those of `run`, if given; older checkpoints do not record their settings.
     """
     where, told = f"{folder}: meta of a checkpoint", meta.get("position")
     position = told if isinstance(told, dict) else {}
@@ -164,8 +164,8 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
     """Loads the run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
-    Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or a
-    number of it is not finite.
+    Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or
+    it holds a number that is not finite.
     """
     run = Run.load(folder)
     checkpoints = Checkpoints(user_path(folder) / "checkpoints")

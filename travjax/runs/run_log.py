@@ -1,4 +1,4 @@
-"""What a training run reports: metrics.jsonl, a line for each report, and TensorBoard."""
+"""The log of a training run: metrics.jsonl, with one line for each report, and TensorBoard files."""
 
 import json
 import time
@@ -16,7 +16,7 @@ FORMERLY = {"watched": "eval_sets"}
 class RunLog:
     """Rows of numbers, each with its `step`, in folder/metrics.jsonl and folder/tensorboard.
 
-    A run that goes on from a step starts with the rows up to there; later ones are cut off.
+    A run that resumes from a step keeps the rows up to that step; later ones are removed.
     Raises InputError when a file cannot be written.
     """
 
@@ -30,7 +30,7 @@ class RunLog:
         board = folder / "tensorboard"
         try:
             board.mkdir(exist_ok=True)
-            # SummaryWriter writes from a thread, which dies over a full disk and lets its caller wait for ever.
+            # SummaryWriter writes from a thread, which dies when the disk is full and leaves its caller waiting.
             self._board = EventsWriter(str(board / "events"))
             if step:
                 later = SessionLog(status=SessionLog.START)
@@ -39,7 +39,7 @@ class RunLog:
             raise InputError(f"{board}: cannot be written: {error.strerror}") from None
 
     def write(self, row: dict[str, Any]) -> None:
-        """Appends a row; a dict in it is a group of numbers."""
+        """Appends a row; a dict within it is a group of numbers."""
         from tensorboardX.proto.event_pb2 import Event
         from tensorboardX.summary import scalar
 
@@ -63,9 +63,9 @@ class RunLog:
 
 
 def read_rows(path: Path) -> list[dict[str, Any]]:
-    """Reads the rows of a metrics.jsonl, none if there is no file, and prints which lines are no rows with their step.
+    """Reads the rows of a metrics.jsonl, none if there is no file; prints which lines are not rows with a step.
 
-    They are left out: a run does not stop over a damaged log. A last line that was cut short is passed over in silence.
+    Those lines are left out: a damaged log does not stop a run. A last line that was cut short is skipped silently.
     Old keys are taken for what they are called now, and named in a line; a row must not have both.
     Raises InputError when the file cannot be read.
     """
