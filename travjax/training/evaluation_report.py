@@ -1,4 +1,4 @@
-"""Evaluation of a training run on its test maps: tables, figures and JSON in a folder."""
+"""Evaluates a training run on its test maps: tables, figures and JSON in a folder."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -39,14 +39,14 @@ def evaluate_run(
     figure_maps: int = 2,
     baselines: bool = True,
 ) -> Evaluation:
-    """Evaluates a training run, prints the tables and writes them with the figures; returns the network's figures.
+    """Evaluates a training run, prints the tables and writes them with the figures; returns the network's scores.
 
     data:       folder of a data set, instead of the run's own
     checkpoint: "best", "latest" or "heads"
-    out:        folder to write to, instead of one in that of the run
-    maps, each: random test maps and random trajectories of each, 0 for all, instead of the preset's
-    recalls:    those to find thresholds for; figure_maps: maps in predictions.png
-    baselines:  whether the predictors to beat are evaluated as well
+    out:        folder to write to, instead of one in the run's folder
+    maps, each: number of random test maps and of random trajectories of each, 0 for all, instead of the preset's
+    recalls:    recalls to find thresholds for; figure_maps: number of maps in predictions.png
+    baselines:  whether to evaluate the baselines as well
     Raises InputError when the run, its checkpoint or its data set is missing, damaged, or does not fit.
     """
     place = user_path(folder)
@@ -77,7 +77,7 @@ def _probabilities(evaluator: Evaluator, estimator: Network, samples: Samples, w
 
 
 def _baselines(folder: Path, evaluator: Evaluator, samples: Samples, recalls: Sequence[float]) -> dict[str, Evaluation]:
-    """Evaluates the predictors to beat: heads on the trunk as it was, and a regression on the ground alone."""
+    """Evaluates the baselines: heads on the trunk before it was trained, and a regression on the ground alone."""
     others = {}
     if evaluator.run.preset.training.head_epochs:
         try:
@@ -91,7 +91,7 @@ def _baselines(folder: Path, evaluator: Evaluator, samples: Samples, recalls: Se
 
 
 def _description(evaluator: Evaluator, samples: Samples, checkpoint: str, position: dict) -> dict:
-    """Says what was evaluated on what."""
+    """Describes which checkpoint was evaluated, and on which data."""
     trained, data = evaluator.run, evaluator.dataset
     return {
         "checkpoint": checkpoint,
@@ -140,7 +140,7 @@ def _write_tables(
 
 
 def _margin_errors(errors: np.ndarray, robot: Robot) -> str:
-    """Returns one line on mean absolute errors [k] of the margins of a robot's events."""
+    """Returns one line with the mean absolute errors [k] of the margins of a robot's events."""
     each = ", ".join(f"{event.name} {event.shown(error)}" for event, error in zip(robot.events, errors, strict=True))
     return f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: {each}"
 
@@ -154,7 +154,7 @@ def _draw(
     maps: int,
     samples: int,
 ) -> None:
-    """Draws curves, calibration and, unless `maps` is 0, predictions on so many maps."""
+    """Draws curves, calibration and, unless `maps` is 0, predictions on `maps` maps."""
     figure = score_figures.precision_recall_figure(scores, evaluator.paper, others)
     progress.wrote(map_figures.save(figure, out / "precision_recall.png"))
     progress.wrote(map_figures.save(score_figures.reliability_figure(scores), out / "reliability.png"))
@@ -163,9 +163,9 @@ def _draw(
 
 
 def _predictions(evaluator: Evaluator, estimator: Network, maps: int, samples: int) -> Figure:
-    """Draws prediction over truth on the action space of test maps that fail neither nowhere nor everywhere.
+    """Draws predictions over labels for the action space of test maps where only some trajectories fail.
 
-    samples: those that were evaluated; where they are few, not all trajectories are shown
+    samples: the evaluated samples; where they are few, not all trajectories are shown
     """
     data, trained = evaluator.dataset, evaluator.run
     shown = evaluator.to_show(maps)

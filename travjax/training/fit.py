@@ -1,4 +1,4 @@
-"""Fitting an estimator: from a preset to a trained run in a folder, which goes on where it was interrupted."""
+"""Fits an estimator: from a preset to a trained run in a folder; an interrupted run can be resumed."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -34,14 +34,14 @@ def run_from_preset(
     weights: str | None = None,
     seed: int | None = None,
 ) -> Run:
-    """Returns the run of a preset, with what is to differ from it.
+    """Returns the run of a preset, with any settings that are to differ from it.
 
     preset:  a preset, or its TOML file
     robot, actions, size, spacing: as `load_setup` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
-    seed:    of data set and training
+    seed:    seed of the data set and of training
     Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
-    seed that cannot be.
+    seed out of range.
     """
     preset = preset if isinstance(preset, Preset) else Preset.load(preset)
     if weights:
@@ -66,12 +66,12 @@ def fit(
 ) -> None:
     """Trains a run in a folder, and prints what it writes there.
 
-    devices: to train on, all unless given
+    devices: devices to train on, all unless given
     data:    folder of its data set, instead of one made by the preset
-    resume:  goes on with the run that the folder holds, if it holds one
+    resume:  whether to resume the run that the folder holds, if it holds one
     option:  what a message calls a folder that holds another run
-    Raises InputError before it trains: another process works in the folder, it holds a run that differs or is not to be
-    gone on with, first weights or data set are missing or damaged or do not fit.
+    Raises InputError before training starts when another process works in the folder, when it holds a run that differs
+    or is not to be resumed, and when first weights or data set are missing, damaged or do not fit.
     """
     devices, place = devices or Devices.all(), user_path(folder)
     with held(place) if devices.main else nullcontext():
@@ -112,7 +112,7 @@ def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
 
 
 def _dataset(data: str | Path | None, wanted: Run, folder: Path, devices: Devices) -> Dataset:
-    """Returns the data set that is given, else the run's own, which is made if it is not there yet."""
+    """Returns the given data set, else the run's own, which is made if it does not exist yet."""
     if data:
         return dataset.load(data)
     kept, config = folder / DATA, wanted.preset.dataset
@@ -129,7 +129,7 @@ def _dataset(data: str | Path | None, wanted: Run, folder: Path, devices: Device
 
 
 def _draw_inputs(trainer: Trainer, folder: Path) -> Path:
-    """Draws the three channels of a few training samples."""
+    """Draws the three input channels of a few training samples."""
     samples, data, run = trainer.data.samples(2, 0), trainer.data.dataset, trainer.run
     chosen = np.linspace(0, len(samples[0]) - 1, 4).astype(int)
     maps, trajectories = (index[chosen] for index in samples)
@@ -147,7 +147,7 @@ def _draw_inputs(trainer: Trainer, folder: Path) -> Path:
 
 
 def _finish(folder: Path) -> None:
-    """Draws the figure of the run, and prints where everything is."""
+    """Draws the training figure of the run, and prints where everything was written."""
     rows, events = folder / "metrics.jsonl", Run.load(folder).robot.event_names
     progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):

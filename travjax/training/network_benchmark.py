@@ -1,6 +1,6 @@
-"""How fast the network is: its inputs, a training step beside PyTorch's, and all trajectories of a map, in one run.
+"""Measures the network: its inputs, a training step beside PyTorch's, and all trajectories of a map, in one run.
 
-Medians of repeated calls on compiled code. The PyTorch network is the same one in its fastest form on a CPU,
+Times are medians of repeated calls of compiled code. The PyTorch network is the same one in its fastest form on a CPU,
 channels-last; it is measured where PyTorch is installed.
 """
 
@@ -53,7 +53,9 @@ FLAX, TORCH = "training step, Flax", "training step, PyTorch"
 
 
 class Bench:
-    """A small data set on the devices and the estimator with random weights, a ResNet50 unless said otherwise."""
+    """A small data set on the devices and an estimator with random weights, a ResNet50 unless another trunk is
+    given.
+    """
 
     def __init__(
         self, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int, trunk: ResNetConfig = ResNetConfig()
@@ -65,7 +67,7 @@ class Bench:
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
-        """Yields one row for each thing that is measured."""
+        """Yields one row for each measurement."""
         yield self.inputs()
         yield self.training_step()
         try:
@@ -144,7 +146,7 @@ class Bench:
 def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15) -> None:
     """Measures inputs, a training step and all trajectories of a map; prints the table and writes it as TSV.
 
-    repeats: timed calls of which the median is taken
+    repeats: number of timed calls; the median is reported
     Raises InputError when nothing can be written to `out`.
     """
     folder = output_folder(out)
@@ -153,7 +155,7 @@ def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, rep
 
 
 def with_ratio(rows: list[dict]) -> list[dict]:
-    """Returns the rows, the Flax step's with its time as a multiple of PyTorch's if that was measured."""
+    """Returns the rows with the Flax step's time as a multiple of PyTorch's, if that was measured."""
     ms = {row["what"]: row["ms"] for row in rows}
     ratio = ms[FLAX] / ms[TORCH] if TORCH in ms else None
     return [row | {"ratio": ratio if row["what"] == FLAX else None} for row in rows]
@@ -195,7 +197,7 @@ def torch_estimator():
 
 
 def _torch_training(grid: Grid) -> Callable[[], object]:
-    """Makes a training step of the PyTorch estimator on a fixed batch of random images."""
+    """Returns a function that takes a training step of the PyTorch estimator on a fixed batch of random images."""
     import torch
     from torch import nn
 

@@ -1,7 +1,7 @@
 """One step of training: a jitted function of the state and a batch.
 
 The state is a dict of pytrees: parameters of "trunk" and "heads", the running "statistics", and the "optimizer" state
-of what the phase trains.
+of the parts that the phase trains.
 """
 
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ State = dict[str, Any]
 
 @dataclass(frozen=True)
 class StepSettings:
-    """What a step is compiled for.
+    """The static settings that a step is compiled for.
 
-    graph:   what is fixed of the network
-    phase:   whose loss is lowered and whose parts are trained
-    penalty: times the sum of squares of the heads' kernels, added to the loss
+    graph:   the static part of the network
+    phase:   the phase, which defines the loss and the parts that are trained
+    penalty: factor of the sum of squares of the heads' kernels, which is added to the loss
     """
 
     graph: nnx.GraphDef
@@ -41,10 +41,10 @@ class StepSettings:
 def update(
     state: State, batch: Batch, seed: int | Int[Array, ""], step: int | Int[Array, ""], *, settings: StepSettings
 ) -> tuple[State, Float[Array, ""]]:
-    """Takes one step: returns the new state, and the mean of the loss over the batch.
+    """Takes one step; returns the new state and the mean loss over the batch.
 
-    batch:      with inputs as the phase places them on the devices
-    seed, step: of the random numbers of the step
+    batch:      its inputs are placed on the devices as the phase does it
+    seed, step: together they seed the random numbers of the step
     """
     phase, key = settings.phase, jax.random.fold_in(key_of(seed), step)
 
@@ -69,5 +69,5 @@ def _squares(heads: nnx.State) -> Float[Array, ""]:
 
 @jax.jit
 def is_finite(state: State) -> jax.Array:
-    """Returns whether all of it is numbers."""
+    """Tells whether every number of the state is finite."""
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()

@@ -1,7 +1,7 @@
-"""Training in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
+"""Trains in two phases (SPEC section 9): the heads on the features of the frozen trunk, then everything.
 
-All that is random follows from the training seed and the step, so a run that was interrupted goes on as if it had not
-been. What a step does is in step.py; the estimator's kind (estimators/kind.py) says with which loss, on what.
+All random numbers follow from the training seed and the step, so a run that was interrupted continues as if it had not
+been. A step is in step.py; the estimator's kind (estimators/kind.py) defines the loss and the training data.
 """
 
 import math
@@ -35,18 +35,18 @@ from travjax.runs.run_log import RunLog
 from travjax.training.step import State, StepSettings, is_finite, update
 
 IN_FLIGHT = 2
-"""Steps whose loss the host has not looked at yet: the device works while the host prepares the next batch."""
+"""Steps whose loss the host has not read yet: the device works while the host prepares the next batch."""
 
 REPORTS = 20
-"""Rows of the training loss in an epoch."""
+"""Number of training-loss rows logged in an epoch."""
 
 
 @dataclass
 class Position:
-    """Where training stands; with the state, all that is needed to go on.
+    """Where training stands; together with the state, all that is needed to resume.
 
-    phase: 1 or 2; epoch: of the phase; step: of the epoch; total: steps in all
-    loss, samples: sums over the epoch so far; best: largest overall average precision of a validation so far
+    phase: 1 or 2; epoch: within the phase; step: within the epoch; total: number of steps over all epochs
+    loss, samples: sums over the epoch so far; best: largest overall average precision on validation so far
     """
 
     phase: int = 1
@@ -95,14 +95,14 @@ class Trainer:
 
     @cached_property
     def source(self) -> Any:
-        """The maps as the estimator takes them, on the devices."""
+        """The maps in the form the estimator takes, on the devices."""
         with self._bar("trajectory bank", len(self.run.actions), "trajectory") as bar:
             source = self.run.source(self.data.dataset.heights, bar.update)
         return self.devices.replicate(source)
 
     @property
     def phase(self) -> Phase:
-        """What the steps of the present phase do."""
+        """The definition of the present phase."""
         return self.kind.phases[self.position.phase]
 
     @cached_property
@@ -116,16 +116,16 @@ class Trainer:
 
     @usual_flags()
     def start(self, estimator: Network) -> None:
-        """Begins with an estimator, whose trunk phase 1 leaves as it is."""
-        variables = jax.tree.map(jax.numpy.copy, split_model(estimator)[1])  # steps take the state's memory
+        """Starts from an estimator; phase 1 leaves its trunk unchanged."""
+        variables = jax.tree.map(jax.numpy.copy, split_model(estimator)[1])  # steps reuse the memory of the state
         self.state: State = self.devices.replicate(variables)
         self._begin(1 if self.config.head_epochs else 2)
 
     @usual_flags()
     def resume(self) -> None:
-        """Goes on from the latest checkpoint that is whole; a damaged one is passed over with a notice.
+        """Resumes from the latest intact checkpoint; a damaged one is skipped with a notice.
 
-        Raises InputError when there is none, or it was trained on another data set.
+        Raises InputError when there is none, or when it was trained on another data set.
         """
         optimizer = lambda meta: checked_meta(meta, self.folder)["optimizer"]
         template = lambda meta: self.run.template(optimizer(meta), self.devices.everywhere)
@@ -140,9 +140,9 @@ class Trainer:
 
     @usual_flags()
     def train(self) -> None:
-        """Trains from the present position to the end, with a checkpoint every so many steps and after each epoch.
+        """Trains from the present position to the end, with a checkpoint at regular steps and after each epoch.
 
-        Raises InputError when another process works in the folder, and when the loss is no number any more; the last
+        Raises InputError when another process works in the folder, and when the loss becomes NaN or infinite; the last
         checkpoint is kept.
         """
         with held(self.folder) if self.devices.main else nullcontext():
@@ -169,7 +169,7 @@ class Trainer:
     def _begin(self, phase: int) -> None:
         """Begins a phase with a new optimizer, for what it trains."""
         self.position.phase, self.position.epoch = phase, 0
-        self.__dict__.pop("features", None)  # gigabytes for a large data set
+        self.__dict__.pop("features", None)  # they take gigabytes for a large data set
         if not self.phase.frozen_trunk:
             self._given_features = None
         trained = {name: self.state[name] for name in self.phase.trained}
@@ -186,7 +186,7 @@ class Trainer:
         return self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
-        if phase not in self._optimizers:  # the same object each time: jit compiles for it
+        if phase not in self._optimizers:  # jit compiles once for each object, so keep it
             self._optimizers[phase] = self.config.make_optimizer(phase, self._planned_steps(phase))
         return self._optimizers[phase]
 
@@ -219,7 +219,7 @@ class Trainer:
             yield batch._replace(inputs=self.features["training"][batch.inputs]) if self.phase.frozen_trunk else batch
 
     def _step(self, batch: Batch) -> jax.Array:
-        """Takes a step and returns its loss, which the devices may still be at work on."""
+        """Takes a step and returns its loss, which the devices may still be computing."""
         phase, devices = self.phase, self.devices
         frozen = phase.frozen_trunk
         inputs = devices.shard(batch.inputs) if frozen else phase.place(self.source, batch.inputs, devices)
@@ -254,7 +254,7 @@ class Trainer:
         self.checkpoints.save(here.total, self.state, self._meta(here.phase) | {"validation": row}, best)
 
     def _validated(self) -> dict[str, Any]:
-        """Loss, that of the best constant predictor, average precision and F1 on the validation samples."""
+        """Returns loss, the best constant predictor's loss, average precision and F1 on the validation samples."""
         logits = self._logits("validation")
         failed = self.data.failed(self.data.validation)
         share = failed.mean(axis=0, dtype=np.float64)
@@ -277,7 +277,7 @@ class Trainer:
         return {"eval_sets": metrics.json_ready(scores)} if names else {}
 
     def _logits(self, name: str) -> np.ndarray:
-        """Returns the logits of the samples of that name, by the present state: [k, events]."""
+        """Returns the logits of the named samples in the present state: [k, events]."""
         if frozen := self.phase.frozen_trunk:
             features = self.devices.replicate(self.features[name])
             logits = self.devices.fetch(frozen.logits(self.graph, self._variables, features))
@@ -313,7 +313,7 @@ class Trainer:
     def _report(self, row: dict[str, Any]) -> None:
         here = self.position
         schedule = self.config.schedule_of(here.phase, self._planned_steps(here.phase))
-        rate = float(schedule(here.epoch * self.data.steps(here.phase) + here.step - 1))  # of the step before
+        rate = float(schedule(here.epoch * self.data.steps(here.phase) + here.step - 1))  # the rate of the step before
         place = {"step": here.total, "phase": here.phase, "epoch": here.epoch + 1, "learning_rate": rate}
         if self.log:
             self.log.write(place | row)
