@@ -1,5 +1,5 @@
-"""The two estimators as Flax modules, and what they look at.
+"""The two estimators as Flax modules, and their inputs.
 
-In: elevation maps and trajectories. Out: images of the network, logits of failures, margins.
+In: elevation maps and trajectories. Out: input images of the network, logits of failures, margins.
 Stands on resnet/ and simulation/.
 """

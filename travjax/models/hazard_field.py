@@ -1,10 +1,10 @@
 """The hazard-field estimator: one pass over a map for all trajectories.
 
-A U-Net turns elevation into a few channels at every node, which are made once for a map. The hazard of a pose - a logit
-and a margin for each event - is a small network of these channels at the pose's stencil (pose_stencil.py), the same at
-every place and heading, so the field is defined at any pose and not at bins of them. A trajectory's logit is the
-log-sum-exp of its poses' logits, its margin the largest of theirs; first arcs are read once for all second arcs after
-them.
+A U-Net turns the elevation into a few channels at every node, once for each map. The hazard of a pose, a logit and a
+margin for each event, is computed by a small network from these channels at the pose's stencil (pose_stencil.py). That
+network is the same at every place and heading, so the field is defined at any pose, without bins. A trajectory's logit
+is the log-sum-exp of its poses' logits, its margin the largest of their margins; a first arc is read once for all
+second arcs that follow it.
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ from travjax.resnet.network import ConvNorm
 from travjax.simulation.events import EVENTS
 
 RELIEF = 9
-"""Nodes along the edge of the window whose mean is taken off the elevation for the first input channel."""
+"""Nodes along the edge of the window whose mean is subtracted from the elevation for the first input channel."""
 
 COARSE = 5.0
-"""Elevation scales that count as 1 in the second, where the map's large forms are seen."""
+"""Elevation scales that count as 1 in the second input channel, which shows the map's large forms."""
 
 FIRST_LOGIT = -6.0
-"""Of each pose, before training: failures are rare, and a trajectory has many poses."""
+"""Logit of each pose before training: failures are rare, and a trajectory has many poses."""
 
 LARGE_MARGIN = 4.0
-"""Limits; margins are not told apart from there on."""
+"""Multiple of a limit above which margins are no longer told apart."""
 
 _he_normal = nnx.initializers.he_normal()
 
@@ -43,8 +43,8 @@ class FieldConfig:
 
     stem:          channels at full resolution
     widths:        channels of each level of the U-Net, the first at half resolution
-    channels:      channels at each node that poses read, the elevation itself among them
-    hidden:        units of each of the two layers that make a pose's hazard of them
+    channels:      channels at each node that poses read, including the elevation itself
+    hidden:        units of each of the two layers that compute a pose's hazard from them
     margin_weight: weight of the margins in the loss, beside the cross-entropy of the failures
     epsilon, momentum: of batch normalisation, as in the ResNet
     dtype:         type of the U-Net's activations, "float32" or "bfloat16"
@@ -75,7 +75,7 @@ class FieldConfig:
 
 
 class Block(nnx.Module):
-    """Two convolutions of 3 x 3 beside a shortcut."""
+    """Two 3 x 3 convolutions with a shortcut."""
 
     def __init__(self, width: int, config: FieldConfig, *, rngs: nnx.Rngs):
         self.first = ConvNorm(width, width, 3, 1, config, rngs=rngs)
@@ -86,7 +86,7 @@ class Block(nnx.Module):
 
 
 class UNet(nnx.Module):
-    """Elevation to channels at each node (after Ronneberger et al. 2015, arXiv 1505.04597)."""
+    """Network from elevation to channels at each node (after Ronneberger et al. 2015, arXiv 1505.04597)."""
 
     def __init__(self, config: FieldConfig, *, rngs: nnx.Rngs):
         widths, steps = config.widths, list(zip(config.widths, config.widths[1:], strict=False))
@@ -129,7 +129,7 @@ class UNet(nnx.Module):
 
 
 class PoseHead(nnx.Module):
-    """The channels at a pose's stencil to its logits and margins."""
+    """Network from the channels at a pose's stencil to the pose's logits and margins."""
 
     def __init__(self, config: FieldConfig, events: int, *, rngs: nnx.Rngs):
         inputs, hidden, outputs = (STENCIL_NODES + 1) * config.channels, config.hidden, 2 * events
@@ -152,7 +152,7 @@ class PoseHead(nnx.Module):
 
 
 class HazardField(nnx.Module):
-    """Elevation maps to the logits and margins of all trajectories."""
+    """Network from elevation maps to the logits and margins of all trajectories."""
 
     def __init__(self, trunk: UNet, heads: PoseHead):
         self.trunk = trunk
@@ -169,7 +169,7 @@ class HazardField(nnx.Module):
     def at(self, channels: Float[Array, "b rows cols c"], nodes) -> Float[Array, "p b h"]:
         """Returns the field at poses of stencils [p, s], from the channels at all nodes."""
         maps, rows, cols, count = channels.shape
-        # Maps and channels side by side: a row is read for each node, and added to in the gradient, at full width.
+        # Maps and channels lie side by side, so that each node is one wide row to read, and to add to in the gradient.
         by_node = channels.reshape(maps, rows * cols, count).transpose(1, 0, 2).reshape(rows * cols, -1)
         ground = by_node.at[nodes].get(mode="promise_in_bounds")
         return self.heads(ground.reshape(*nodes.shape, maps, count))

@@ -1,11 +1,11 @@
-"""What the network sees of a map and a trajectory: three channels (SPEC section 6, the paper's Fig. 1).
+"""The network's input for a map and a trajectory: three channels (SPEC section 6, the paper's Fig. 1).
 
 1. elevation:  height above the robot's, in units of `elevation_scale` metres, clipped to [-LIMIT, LIMIT]
 2. trajectory: 1 on the path of the robot's centre, falling to 0 half a track away
 3. wheels:     the same for the four wheel paths, half a wheel's width wide; 1 where a front and a rear wheel both pass
 
-Channels 2 and 3 do not depend on the map. They are drawn once for all trajectories of an action space, the bank, in
-bytes (1 is 255), and images are put together on the device. Rows and columns are those of grid.py.
+Channels 2 and 3 do not depend on the map. They are drawn once for all trajectories of an action space and kept as the
+bank, in bytes (255 stands for 1); images are assembled on the device. Rows and columns are those of grid.py.
 """
 
 import hashlib
@@ -39,13 +39,13 @@ LIMIT = 4.0
 """Largest value of the elevation channel, and of its negative."""
 
 FORMAT = 1
-"""Of the bank's file; a change to how channels are drawn makes it another one."""
+"""Version of the bank's file; raise it when the drawing of channels changes."""
 
 STRAIGHT = 1e6
-"""Metres: radius that straight lines are drawn with; over 10 m they are 13 micrometres off."""
+"""Metres: radius that stands for a straight line; over 10 m it is off by 13 micrometres."""
 
 TRAJECTORIES_AT_ONCE = 16
-"""Arcs drawn at once: their distances fit in the second-level cache."""
+"""Arcs drawn at once, so that their distances fit in the second-level cache."""
 
 
 @usual_flags()
@@ -62,19 +62,19 @@ def render_inputs(
     """Returns the network's inputs for samples of maps and trajectories.
 
     heights:          [n, rows, cols] or [rows, cols] metres, NaN unknown, as for `simulate`
-    map_index:        [b] integers or one, which map of the batch
-    trajectory_index: [b] integers or one, which trajectory of the action space
+    map_index:        [b] integers or one integer, the map of each sample
+    trajectory_index: [b] integers or one integer, the trajectory of each sample
     robot, actions:   the Seekur Jr and the paper's action space unless given
     elevation_scale:  metres that count as 1 in the elevation channel
     Returns [b, rows, cols, 3] in the order of CHANNELS, without b where both indices are single numbers. Source: SPEC
     section 6.
-    Raises InputError as `simulate` does, for indices that are no integers or out of range, and for a scale that is not
-    above 0.
+    Raises InputError as `simulate` does, for indices that are not integers or are out of range, and for a scale that is
+    not above 0.
     """
     maps, _ = as_maps(heights, grid)
     robot, actions = chosen_robot(robot), chosen_actions(actions)
     require_number("elevation_scale", elevation_scale, 0, np.inf, "a length in metres above 0")
-    node_table(robot, actions, grid)  # refuses what does not fit together
+    node_table(robot, actions, grid)  # raises where they do not fit together
     of_map = _checked_index("map_index", map_index, len(maps))
     of_trajectory = _checked_index("trajectory_index", trajectory_index, len(actions))
     if of_map.ndim and of_trajectory.ndim and of_map.shape != of_trajectory.shape:
@@ -98,7 +98,7 @@ def _checked_index(name: str, index, count: int) -> np.ndarray:
 @partial(jax.tree_util.register_dataclass, data_fields=["heights", "bank", "elevation_scale"], meta_fields=[])
 @dataclass(frozen=True)
 class ImageSource:
-    """What images are put together from, on the device.
+    """The arrays on the device that images are assembled from.
 
     heights: [n, rows, cols] metres; bank: [t, rows, cols, 2] bytes; elevation_scale: metres that count as 1
     """
@@ -121,7 +121,7 @@ class ImageSource:
         return ImageSource(heights, bank, np.float32(elevation_scale))
 
     def images(self, map_index: Int[Array, " b"], trajectory_index: Int[Array, " b"]) -> Float[Array, "b rows cols 3"]:
-        """Images of samples, as `assemble` makes them."""
+        """Returns images of samples, as `assemble` does."""
         return assemble(self.heights, self.bank, map_index, trajectory_index, self.elevation_scale)
 
 
@@ -133,7 +133,7 @@ def assemble(
     trajectory_index: Int[Array, " b"],
     elevation_scale: float | np.float32 = 1.0,
 ) -> Float[Array, "b rows cols 3"]:
-    """Images of samples, on the device: the map's elevation channel beside the bank's two of the trajectory."""
+    """Assembles images of samples on the device: the map's elevation channel and the trajectory's two of the bank."""
     elevation = elevation_channel(heights[map_index], elevation_scale)
     channels = bank[trajectory_index].astype(jnp.float32) / 255
     return jnp.concatenate([elevation[..., None], channels], axis=-1)
@@ -165,10 +165,10 @@ def trajectory_bank(
     cache: Path | None = None,
     on_progress: Callable[[int], object] = lambda count: None,
 ) -> UInt8[np.ndarray, "t rows cols 2"]:
-    """Channels 2 and 3 of every trajectory: 101 MB for the paper's action space.
+    """Returns channels 2 and 3 of every trajectory: 101 MB for the paper's action space.
 
-    cache: folder that keeps it, one file a configuration (the user's cache unless given); a damaged file is made anew,
-           and a folder that cannot be written to, or a user without a cache, is done without
+    cache: folder that keeps it, with one file for each configuration (the user's cache unless given); a damaged file
+           is made again, and nothing is kept where the folder cannot be written to or there is no cache
     on_progress: is told how many trajectories were added
     """
     configuration = repr((FORMAT, robot.track, robot.wheelbase, robot.wheel_width, actions, grid))
@@ -185,7 +185,7 @@ def trajectory_bank(
         bank[numbers] = trajectory_channels(robot, actions, grid, numbers)
         on_progress(block)
     if folder:
-        with suppress(InputError, OSError):  # it is made again the next time
+        with suppress(InputError, OSError):  # it is made again next time
             folder.mkdir(parents=True, exist_ok=True)
             save_npz(folder / name, bank=bank, configuration=configuration)
     return bank
@@ -205,9 +205,9 @@ def _read_bank(path: Path, configuration: str) -> np.ndarray | None:
 def trajectory_channels(
     robot: Robot, actions: ActionSpace, grid: Grid, trajectories: Int[np.ndarray, " k"]
 ) -> UInt8[np.ndarray, "k rows cols 2"]:
-    """Channels 2 and 3 of some trajectories, 1 is 255. First arcs are drawn once for all that share them."""
+    """Draws channels 2 and 3 of some trajectories, with 255 for 1; a first arc is drawn once for all that share it."""
     turn, first, second = actions.split(np.asarray(trajectories))
-    starts = actions.first_poses(turn, first)[:, [0, -1]]  # of the first arc and of the second
+    starts = actions.first_poses(turn, first)[:, [0, -1]]  # where the first and the second arc start
     widths = (robot.track / 2, robot.wheel_width / 2)
     shared, place = np.unique(turn * len(actions.radii) + first, return_index=True, return_inverse=True)[1:]
     arcs = partial(_arc_marks, robot=robot, widths=widths, grid=grid)
@@ -225,9 +225,9 @@ def trajectory_channels(
 
 
 def _arc_marks(start, radius, length: float, *, robot: Robot, widths, grid: Grid) -> np.ndarray:
-    """Marks of the centre and the four wheels along arcs from `start` [k, 3] of signed `radius` [k].
+    """Draws the paths of the centre and the four wheels along arcs from `start` [k, 3] of signed `radius` [k].
 
-    Returns [k, 5, rows, cols] uint16, 1 is 65535.
+    Returns [k, 5, rows, cols] uint16, where 65535 stands for 1.
     """
     marks = np.empty((len(start), 5, *grid.shape), np.uint16)
     offsets = ((0.0, 0.0), *robot.wheel_positions())
@@ -250,7 +250,7 @@ def _point_path(start, radius, length: float, right: float, forward: float) -> n
     radius = np.copysign(np.minimum(np.abs(radius), STRAIGHT), radius)
     x, y, heading = start.T
     half = length / radius / 2
-    # From the centre of the circle, to the left of the robot, with the robot in the middle of its way.
+    # Seen from the centre of the circle, which is to the left of the robot, with the robot halfway along the arc.
     cos, sin = np.cos(heading + half), np.sin(heading + half)
     out_x, out_y = (radius + right) * cos - forward * sin, (radius + right) * sin + forward * cos
     distance = np.hypot(out_x, out_y)

@@ -1,7 +1,7 @@
-"""Which nodes the hazard field is read from at every pose of the action space: static tables, as in footprint.py.
+"""The nodes that the hazard field is read from at every pose of the action space: static tables, as in footprint.py.
 
-What happens at a pose depends on the ground under its wheels, on that under them one interval of path before, and on
-that under the chassis. The stencil of a pose is the node nearest to each of these places.
+A failure at a pose depends on the ground under the wheels, the ground under them one path interval before, and the
+ground under the chassis. The stencil of a pose holds the node nearest to each of these places.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ ACROSS, ALONG = 2, 5
 """Places under the chassis, evenly spread over its width and length."""
 
 STENCIL_NODES = 8 + ACROSS * ALONG
-"""Of a stencil: the wheels FL, FR, RL, RR, the same one interval before, and those under the chassis."""
+"""Nodes of a stencil: the wheels FL, FR, RL, RR, the same one interval before, and those under the chassis."""
 
 Nodes = Int[np.ndarray, "*p s"]
 
@@ -28,12 +28,12 @@ Nodes = Int[np.ndarray, "*p s"]
 @partial(jax.tree_util.register_dataclass, data_fields=["nodes"], meta_fields=["first_poses", "second_arcs"])
 @dataclass(frozen=True)
 class Stencil:
-    """The stencils of all poses, first arc by first arc; the letters in shapes are those of footprint.py.
+    """The stencils of all poses, first arc by first arc; shapes use the letters of footprint.py.
 
-    nodes:       [F, P, s] int32 nodes (row * cols + col): of first arcs their own poses, then those of each second
-                 arc in turn, so that trajectories come in the order of the action space
-    first_poses: poses of a first arc, the junction included
-    second_arcs: second arcs after each first one
+    nodes:       [F, P, s] int32 nodes (row * cols + col): for each first arc its own poses, then those of each of
+                 its second arcs, so that trajectories come in the order of the action space
+    first_poses: number of poses of a first arc, including the junction
+    second_arcs: number of second arcs after each first one
     """
 
     nodes: Nodes | jax.Array

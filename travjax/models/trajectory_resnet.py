@@ -19,7 +19,7 @@ class HeadsConfig:
     """Size of the heads.
 
     hidden:  units of each head's hidden layer
-    dropout: share of them left out in a training step
+    dropout: share of these units left out in a training step
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -36,7 +36,7 @@ class HeadsConfig:
 
 
 class Head(nnx.Module):
-    """One event's logit: a dense layer with ReLU and dropout, and one of a single unit."""
+    """The head of one event: a dense layer with ReLU and dropout, then one of a single unit, the logit."""
 
     def __init__(self, features: int, config: HeadsConfig, *, rngs: nnx.Rngs):
         self.hidden = nnx.Linear(features, config.hidden, rngs=rngs)
@@ -65,7 +65,7 @@ class Heads(nnx.Module):
 
 
 class Estimator(nnx.Module):
-    """Images of map and trajectory to a logit for each event."""
+    """Network from images of map and trajectory to a logit for each event."""
 
     def __init__(self, trunk: ResNet, heads: Heads):
         self.trunk = trunk

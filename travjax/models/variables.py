@@ -1,11 +1,11 @@
-"""A network as what is fixed of it and the variables that training changes."""
+"""Splits a network into its static part and the variables that training changes."""
 
 from typing import Any
 
 from flax import nnx
 
 VARIABLES = ("trunk", "heads", "statistics")
-"""What training changes: parameters of trunk and heads, and running means and variances."""
+"""Names of the variables that training changes: parameters of trunk and heads, and running means and variances."""
 
 Network = nnx.Module
 """An estimator's network, of any kind."""
@@ -15,9 +15,9 @@ Variables = dict[str, nnx.State]
 
 
 def split_model(network: Network) -> tuple[nnx.GraphDef, Variables]:
-    """Returns what is fixed of a network, and its VARIABLES.
+    """Returns the static part of a network, and its VARIABLES.
 
-    Parameters under a `heads` are the heads', all others the trunk's; a network may be without either.
+    Parameters below `heads` belong to the heads, all others to the trunk; a network may lack either.
     """
     heads = nnx.PathContains("heads")
     graph, *states = nnx.split(network, nnx.All(nnx.Param, nnx.Not(heads)), nnx.All(nnx.Param, heads), nnx.BatchStat)
@@ -25,5 +25,5 @@ def split_model(network: Network) -> tuple[nnx.GraphDef, Variables]:
 
 
 def merge_model(graph: nnx.GraphDef, variables: Variables) -> Any:
-    """Inverts `split_model`; the network has variables of its own."""
+    """Inverts `split_model`; the network gets its own copy of the variables."""
     return nnx.merge(graph, *(variables[name] for name in VARIABLES), copy=True)
