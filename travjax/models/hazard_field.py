@@ -105,7 +105,7 @@ class UNet(nnx.Module):
         """Returns the channels at all nodes.
 
         elevation: in units of the elevation scale
-        train:     normalises by the batch's statistics, as ConvNorm does
+        train:     whether to normalise by the batch's statistics, as ConvNorm does
         """
         relief = elevation - _window_means(elevation)
         inputs = jnp.stack([relief, elevation / COARSE], axis=-1).astype(self.config.dtype)
@@ -142,7 +142,7 @@ class PoseHead(nnx.Module):
     def __call__(self, ground: Float[Array, "p s b c"]) -> Float[Array, "p b h"]:
         """Returns a logit of each event, then a margin of each in units of the robot's limits.
 
-        The ground is seen relative to its mean over the stencil, and the mean beside it.
+        The inputs are the ground relative to its mean over the stencil, and that mean.
         """
         mean = ground.mean(axis=1, keepdims=True)
         places = jnp.concatenate([ground - mean, mean], axis=1)
@@ -161,7 +161,7 @@ class HazardField(nnx.Module):
     def __call__(
         self, elevation: Float[Array, "b rows cols"], stencil: Stencil, *, train: bool = False
     ) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
-        """Returns logits and margins, the margins in units of the robot's limits, of the trajectories of a stencil."""
+        """Returns the logits of a stencil's trajectories, and their margins in units of the robot's limits."""
         arcs, poses, _ = stencil.nodes.shape
         hazard = self.at(self.trunk(elevation, train), stencil.nodes.reshape(arcs * poses, -1))
         return read_out(hazard.reshape(arcs, poses, *hazard.shape[1:]), stencil)
@@ -176,7 +176,7 @@ class HazardField(nnx.Module):
 
 
 def read_out(hazard: Float[Array, "f p b h"], stencil: Stencil) -> tuple[Float[Array, "b t k"], Float[Array, "b t k"]]:
-    """Returns logits and margins of trajectories from those of their poses, in the order of a stencil's."""
+    """Reduces the logits and margins of poses, in a stencil's order, to those of their trajectories."""
     first, rest = hazard[:, : stencil.first_poses], hazard[:, stencil.first_poses :]
     second = rest.reshape(len(hazard), stencil.second_arcs, -1, *hazard.shape[2:])
     events = hazard.shape[-1] // 2
@@ -189,27 +189,25 @@ def read_out(hazard: Float[Array, "f p b h"], stencil: Stencil) -> tuple[Float[A
 
 @usual_flags()
 def create(config: FieldConfig = FieldConfig(), seed: int = 0, events: int = len(EVENTS)) -> HazardField:
-    """Makes a hazard field for so many events with random parameters."""
+    """Makes a hazard field with random parameters for a number of events."""
     trunk, heads = (nnx.Rngs(key_of(number)) for number in (seed, seed + 1))
     return HazardField(UNet(config, rngs=trunk), PoseHead(config, events, rngs=heads))
 
 
 def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:
-    """Returns the mean of the RELIEF x RELIEF nodes around each, the map's edge repeated."""
+    """Averages the RELIEF x RELIEF nodes around each node, with the map's edge repeated."""
     edge = RELIEF // 2
     padded = jnp.pad(elevation, ((0, 0), (edge, edge), (edge, edge)), mode="edge")
     return lax.reduce_window(padded, 0.0, lax.add, (1, RELIEF, RELIEF), (1, 1, 1), "VALID") / RELIEF**2
 
 
 def _doubled(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols c"]:
-    """Repeats each pixel four times and cuts the result to a shape."""
+    """Doubles the resolution by repeating pixels, and crops to a shape."""
     return images.repeat(2, axis=1).repeat(2, axis=2)[:, : shape[0], : shape[1]]
 
 
 def _four_nodes(images: Float[Array, "b rows cols c"], shape: tuple[int, ...]) -> Float[Array, "b _rows _cols _c"]:
-    """Arranges four groups of channels at half resolution as the nodes (0, 0), (0, 1), (1, 0) and (1, 1) from each
-    on.
-    """
+    """Spreads four groups of channels at half resolution over the four nodes of each 2 x 2 block, row by row."""
     maps, rows, cols, channels = images.shape
     spread = images.reshape(maps, rows, cols, 2, 2, channels // 4).transpose(0, 1, 3, 2, 4, 5)
     return spread.reshape(maps, 2 * rows, 2 * cols, channels // 4)[:, : shape[0], : shape[1]]

@@ -116,7 +116,9 @@ class ImageSource:
         elevation_scale: float,
         on_progress: Callable[[int], object] = lambda count: None,
     ) -> "ImageSource":
-        """Puts all trajectories on maps; arguments of `trajectory_bank`, whose bank it takes."""
+        """Makes the source of all trajectories on maps; the arguments are those of `trajectory_bank`, which it
+        calls.
+        """
         bank = trajectory_bank(robot, actions, grid, on_progress=on_progress)
         return ImageSource(heights, bank, np.float32(elevation_scale))
 
@@ -192,7 +194,7 @@ def trajectory_bank(
 
 
 def _read_bank(path: Path, configuration: str) -> np.ndarray | None:
-    """Reads the bank of a file; None unless its checksums are right and it is of this configuration."""
+    """Reads the bank of a file; returns None unless its checksums match and it has this configuration."""
     try:
         with path.open("rb") as file:
             archive = np.load(file)
@@ -245,7 +247,8 @@ def _arc_marks(start, radius, length: float, *, robot: Robot, widths, grid: Grid
 def _point_path(start, radius, length: float, right: float, forward: float) -> np.ndarray:
     """Returns the arc that a point of the robot describes: [k, 6].
 
-    Its middle x, y; its radius; the unit vector from the centre of its circle to its middle; half its angle.
+    The six numbers are x and y of its middle, its radius, the unit vector from the centre of its circle to its middle,
+    and half its angle.
     """
     radius = np.copysign(np.minimum(np.abs(radius), STRAIGHT), radius)
     x, y, heading = start.T
@@ -262,7 +265,7 @@ def _point_path(start, radius, length: float, right: float, forward: float) -> n
 
 @jax.jit
 def _marks(paths, reach, axis):
-    """Returns g(d; h) times 65535 for every node's distance d from paths [k, 5, 6], h = reach [5]: [k, 5, rows,
+    """Computes g(d; h) times 65535 from each node's distance d to paths [k, 5, 6], h = reach [5]: [k, 5, rows,
     cols].
     """
 

@@ -58,10 +58,9 @@ def stencil(robot: Robot, actions: ActionSpace, grid: Grid) -> Stencil:
 
 
 def nodes_at(poses: np.ndarray, radius: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid) -> Nodes:
-    """Returns the stencils of poses [..., 3] on arcs of signed radius [...]: [..., s] int32. Places off the map are on
-    its edge.
+    """Returns the stencils of poses [..., 3] on arcs of signed radius [...]: [..., s] int32.
 
-    The pose before is the one on the same arc, at the junction as well.
+    Places off the map are moved to its edge. The pose before is always on the same arc, at the junction as well.
     """
     before = arc_poses(poses, np.broadcast_to(radius, poses.shape[:-1]), np.array([-actions.interval]))[..., 0, :]
     wheels = np.array(robot.wheel_positions())

@@ -76,7 +76,8 @@ class Estimator(nnx.Module):
     ) -> Float[Array, "b k"]:
         """Returns logits in the order of the events.
 
-        train: batch statistics in the trunk, and the running ones move; key: for dropout, none without it
+        train: whether the trunk normalises by the batch's statistics and updates the running ones
+        key:   key for dropout; no dropout without it
         """
         features, _ = self.trunk(images, train=train)
         return self.heads(features, key)
@@ -90,7 +91,7 @@ def create(
     weights: Weights | None = None,
     events: tuple[str, ...] = EVENTS,
 ) -> Estimator:
-    """Makes an estimator of events, given by name, with random parameters, or with a trunk of `weights`.
+    """Makes an estimator of the named events with random parameters, or with a trunk of `weights`.
 
     Raises InputError when the weights are those of another trunk.
     """

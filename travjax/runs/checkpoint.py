@@ -65,9 +65,7 @@ class Checkpoints:
         self._save(f"step-{step}{'-best' if best else ''}", state, meta)
 
     def save_named(self, name: str, state: PyTree, meta: dict) -> None:
-        """Saves as `save` does; the checkpoint counts neither as latest nor as best, and replaces one of the same
-        name.
-        """
+        """Saves a checkpoint that counts neither as latest nor as best, and replaces the one of the same name."""
         allowed = re.fullmatch(NAME, name) is not None and name not in ("latest", "best")
         require(allowed, "name", name, "lower-case letters, digits and _, neither latest nor best")
         self._save(name, state, meta)
@@ -163,7 +161,7 @@ class Checkpoints:
 
 
 def load_meta(folder: str | Path, which: str = "latest") -> dict:
-    """Reads the meta of a checkpoint alone: its arrays are neither read nor checked, and Orbax is not imported.
+    """Reads only the meta of a checkpoint: its arrays are neither read nor checked, and Orbax is not imported.
 
     Raises InputError like `Checkpoints.restore`.
     """
@@ -177,7 +175,7 @@ def _checkpoints(folder: Path) -> list[tuple[int, str, Path]]:
 
 
 def _newest_good(folder: Path, which: str, damaged: dict[Path, str], arrays: bool) -> tuple[Path, dict]:
-    """Returns the checkpoint to use and its meta.json; those passed over are added to `damaged`, with the reason.
+    """Returns the checkpoint to use and its meta.json; adds those it skips to `damaged`, with the reason.
 
     A latest checkpoint stands in for a damaged best one.
     """
@@ -213,7 +211,7 @@ class _Unreadable(Exception):
 
 
 def _checked(path: Path, arrays: bool) -> dict:
-    """Reads meta.json once the files (without `arrays`: it alone) are those of SHA256SUMS; raises _Damaged otherwise.
+    """Reads meta.json once the files match SHA256SUMS (only meta.json without `arrays`); raises _Damaged otherwise.
 
     Raises InputError for another format version.
     """
@@ -236,16 +234,14 @@ def _checked(path: Path, arrays: bool) -> dict:
 
 
 def _files(path: Path) -> dict[str, Path]:
-    """Returns the files by path, but hidden ones, which Finder, NFS and the like leave there and Orbax does not
-    read.
-    """
+    """Lists the files by path, except hidden ones, which Finder, NFS and others leave there and Orbax ignores."""
     files = sorted(file for file in path.rglob("*") if not file.is_dir() and file.name != "SHA256SUMS")
     named = {file.relative_to(path).as_posix(): file for file in files}
     return {name: file for name, file in named.items() if not f"/{name}".count("/.")}
 
 
 def _named_leaves(tree: PyTree) -> dict[str, Any]:
-    """Returns the leaves by path: trunk/conv1/kernel."""
+    """Returns the leaves by path, such as trunk/conv1/kernel."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     named = {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
     if len(named) != len(leaves) or not named:
@@ -254,9 +250,7 @@ def _named_leaves(tree: PyTree) -> dict[str, Any]:
 
 
 def _described(leaves: dict[str, Any]) -> dict[str, list]:
-    """Returns dtype and shape of arrays. Raises InputError for what Orbax cannot hold; it would hang on an empty
-    array.
-    """
+    """Returns dtype and shape of arrays; raises InputError for arrays Orbax cannot hold (it hangs on an empty one)."""
     for name, leaf in leaves.items():
         numbers = hasattr(leaf, "dtype") and not jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.extended)
         require(numbers and 0 not in leaf.shape, name, leaf, "an array of numbers that is not empty")
@@ -311,9 +305,7 @@ def _require_room(folder: Path, size: int) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Puts an error into one line. TensorStore reports a full disk and the like as a ValueError that holds the system's
-    error number.
-    """
+    """Puts an error into one line; TensorStore reports a full disk as a ValueError with the system's error number."""
     if isinstance(error, OSError):
         return error.strerror or str(error)
     if code := re.search(r"os_error_code='(\d+)'", str(error)):

@@ -48,7 +48,7 @@ class Evaluator:
         return Evaluator(run, dataset, devices.replicate(source), devices)
 
     def samples(self, maps: int, each: int) -> Samples:
-        """Draws test samples at natural frequency: so many trajectories of so many maps; 0 for all.
+        """Draws random test samples at natural frequency on `maps` maps, with `each` trajectories each; 0 means all.
 
         Raises InputError when there are none.
         """
@@ -95,7 +95,7 @@ class Evaluator:
         return np.minimum(margins[place, samples[1]], largest), np.minimum(true, largest)
 
     def to_show(self, count: int, group: str | None = None) -> np.ndarray:
-        """Returns test maps, of one group or all, for a figure; those that fail in part come first."""
+        """Picks test maps of one group, or of all, for a figure; maps where only some trajectories fail come first."""
         data = self.dataset
         test = data.maps_of("test")
         test = test if group is None else test[data.group[test] == group]
@@ -105,7 +105,7 @@ class Evaluator:
     def whole_maps(
         self, estimator: Network, maps: np.ndarray, on_progress: Progress = lambda count: None, every: int = 1
     ) -> np.ndarray:
-        """Returns the probabilities of all trajectories of maps [k], or of every so many: [k, t, events]."""
+        """Returns the probabilities of every `every`-th trajectory of maps [k]: [k, t, events]."""
         trajectories = np.arange(0, len(self.run.actions), every)
         samples = (np.repeat(maps, len(trajectories)), np.tile(trajectories, len(maps)))
         return self.probabilities(estimator, samples, on_progress).reshape(len(maps), len(trajectories), -1)
@@ -113,8 +113,8 @@ class Evaluator:
     def every(self, maps: int, samples: int) -> int:
         """Returns the step between the trajectories to show, so that a figure takes no longer than `samples` do.
 
-        At most SPARSEST, and prime to the number of radii, so that all turns and arcs are there. Where whole maps are
-        read at once, all are shown.
+        It is at most SPARSEST, and coprime to the number of radii, so that all turns and arcs appear. It is 1 for
+        estimators that read whole maps at once.
         """
         if self.run.kind.reads_whole_maps:
             return 1
@@ -137,7 +137,7 @@ class Evaluator:
         return metrics.PAPER_SYNTHETIC if compares else None
 
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:
-        """Returns all scores of predicted probabilities [k, events], by style or site as well."""
+        """Scores predicted probabilities [k, events], overall and by style or site."""
         groups = self.dataset.group[samples[0]]
         return metrics.evaluate(
             probability,

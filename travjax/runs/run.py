@@ -57,8 +57,9 @@ class Run:
 
     @staticmethod
     def from_json(table: Any, where: object = "saved settings") -> "Run":
-        """Restores what `to_json` gave; prints which keys of `where` are old, and raises InputError over another
-        table.
+        """Restores the run that `to_json` converted; prints which keys of `where` are old.
+
+        Raises InputError for any other table.
         """
         return Run(**parts_from_json(table, _PARTS, where))
 
@@ -98,7 +99,7 @@ class Run:
 
     @usual_flags()
     def graph(self) -> nnx.GraphDef:
-        """Returns what is fixed of the estimator."""
+        """Returns the static part of the estimator, without its arrays."""
         return split_model(nnx.eval_shape(self.create))[0]
 
     @usual_flags()
@@ -131,7 +132,7 @@ def _settings(mine: Any, other: Any, prefix: str = ""):
 
 
 def has_checkpoints(folder: Path) -> bool:
-    """Tells whether training has begun in the folder: it holds a checkpoint, whole or not."""
+    """Tells whether training has begun in the folder: it holds a checkpoint, intact or not."""
     checkpoints = folder / "checkpoints"
     return checkpoints.is_dir() and any(not path.name.startswith(".") for path in checkpoints.iterdir())
 
@@ -161,7 +162,7 @@ def checked_meta(meta: dict, folder: str | Path, run: Run | None = None) -> dict
 
 @usual_flags()
 def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Network, dict]:
-    """Loads the run of a folder, the estimator of one of its checkpoints, and what the checkpoint says of itself.
+    """Loads the run of a folder, the estimator of one of its checkpoints, and the meta of that checkpoint.
 
     which: "best", "latest" or the name of a checkpoint ("heads" is the end of phase 1)
     Raises InputError when there is none, it is damaged, it was trained with other settings than those of run.json, or
@@ -179,6 +180,6 @@ def load_estimator(folder: str | Path, which: str = "best") -> tuple[Run, Networ
 
 
 def named_leaves(variables: Any) -> dict[str, Any]:
-    """Returns the leaves of an estimator's variables by path, in their order: "trunk/trunk/stem/kernel"."""
+    """Returns the leaves of an estimator's variables in order, by path such as "trunk/trunk/stem/kernel"."""
     name = lambda path: jax.tree_util.keystr(path, simple=True, separator="/").removesuffix("/value")
     return {name(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(variables)}

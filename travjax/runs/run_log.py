@@ -86,7 +86,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
 
 
 def _row(line: bytes) -> dict[str, Any] | None:
-    """Parses the row of a line; None where it is none."""
+    """Parses a line; returns None where it is not a row."""
     try:
         row = parse_json(line.decode(), "row")
     except (UnicodeDecodeError, InputError):

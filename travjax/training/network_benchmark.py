@@ -79,7 +79,7 @@ class Bench:
         yield self.all_trajectories()
 
     def inputs(self) -> dict:
-        """Makes a batch, from the drawing of its samples to the images and labels on the device."""
+        """Measures making a batch, from drawing its samples to the images and labels on the device."""
         epochs = iter(range(10**9))
 
         def batch():
@@ -92,7 +92,7 @@ class Bench:
         return self._timed("inputs of a batch, a fresh subset of 64 maps included", BATCH, batch)
 
     def training_step(self) -> dict:
-        """Makes a training step, from sample indices to new parameters."""
+        """Measures a training step of the whole network, from sample indices to new parameters."""
         phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().make_optimizer(2, 1)
         settings = StepSettings(self.graph, phase, optimizer, penalty=0.001)
         trained = {name: self.variables[name] for name in phase.trained}
@@ -111,11 +111,11 @@ class Bench:
         return self._timed(FLAX, STEP_BATCH, step)
 
     def torch_step(self) -> dict:
-        """Makes the same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
+        """Measures the same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
         return self._timed(TORCH, STEP_BATCH, _torch_training(self.dataset.grid))
 
     def all_trajectories(self, batch: int = BATCH, repeats: int = 1) -> dict:
-        """Runs all trajectories of one map through the network, so many at once."""
+        """Measures the network on all trajectories of one map, `batch` at a time."""
         count = len(self.dataset.actions)
         samples = (np.zeros(count, np.int32), np.arange(count, dtype=np.int32))
         variables = self.devices.replicate({name: self.variables[name] for name in VARIABLES})

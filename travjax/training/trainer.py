@@ -167,7 +167,7 @@ class Trainer:
                 self.log.close()
 
     def _begin(self, phase: int) -> None:
-        """Begins a phase with a new optimizer, for what it trains."""
+        """Begins a phase with a new optimizer for the parts that it trains."""
         self.position.phase, self.position.epoch = phase, 0
         self.__dict__.pop("features", None)  # they take gigabytes for a large data set
         if not self.phase.frozen_trunk:
@@ -182,7 +182,7 @@ class Trainer:
         return {name: self.state[name] for name in VARIABLES}
 
     def _planned_steps(self, phase: int) -> int:
-        """Counts the steps of a phase; with samples drawn anew an epoch may have one more or less."""
+        """Counts the steps of a phase; when each epoch draws new samples it may have one more or less."""
         return self.data.steps(phase) * (self.config.head_epochs, self.config.epochs)[phase - 1]
 
     def _optimizer(self, phase: int) -> optax.GradientTransformation:
@@ -191,7 +191,7 @@ class Trainer:
         return self._optimizers[phase]
 
     def _train_epoch(self) -> None:
-        """Trains from the present step to the end of the epoch, its validation and its checkpoint."""
+        """Trains from the present step to the end of the epoch, then validates and saves a checkpoint."""
         here, data = self.position, self.data
         steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
         began = time.perf_counter()
@@ -289,7 +289,7 @@ class Trainer:
         raise self._diverged(f"a {name} logit that is no number", self.position.step)
 
     def summary(self) -> str:
-        """Says in one line what is trained on what."""
+        """Describes in one line the robot, the training data, the first weights and the devices."""
         run, device = self.run, jax.devices()[0].device_kind
         return (
             f"{run.robot.name}, {len(run.actions)} trajectories a map; {self.data.summary()}; first weights: "
@@ -302,7 +302,7 @@ class Trainer:
             return function(placed, samples, self.config.batch_size, bar.update)
 
     def _meta(self, optimizer: int) -> dict[str, Any]:
-        """Returns what a checkpoint says of itself; optimizer: the phase of the one it holds, 0 for none."""
+        """Returns the meta of a checkpoint; optimizer: the phase of the optimizer that it holds, 0 for none."""
         return {
             "position": asdict(self.position),
             "optimizer": optimizer,
