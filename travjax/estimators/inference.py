@@ -1,4 +1,4 @@
-"""A network on many samples, a batch after the other."""
+"""Applies a network to many samples, batch by batch."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ Progress = Callable[[int], object]
 
 
 class NoNumbers(InputError):
-    """An estimator that puts out NaN or infinity: its weights are damaged, or training has diverged."""
+    """Raised when an estimator returns NaN or infinity: its weights are damaged, or training has diverged."""
 
     def __init__(self):
         super().__init__("the estimator puts out NaN or infinity; allowed: one whose weights are not damaged")
@@ -28,7 +28,7 @@ class NoNumbers(InputError):
 class Placed:
     """A network and its source on the devices.
 
-    graph, variables: the network as `split_model` gives it; source: what the estimator's kind makes of maps
+    graph, variables: the network as `split_model` returns it; source: what the estimator's kind makes from maps
     """
 
     graph: nnx.GraphDef
@@ -38,7 +38,7 @@ class Placed:
 
     @staticmethod
     def from_network(network: Network, source: Any, devices: Devices) -> "Placed":
-        """Puts a network on the devices, beside a source that is there."""
+        """Puts a network on the devices, where its source already is."""
         graph, variables = split_model(network)
         return Placed(graph, devices.replicate(variables), source, devices)
 
@@ -54,12 +54,12 @@ def over_samples(
     """Applies a function of a network to k samples, and returns the results on the host.
 
     function:    (graph, variables, source, *indices [b]) -> [b, ...], compiled
-    samples:     indices [k], one array for each that the function takes
+    samples:     indices [k], one array for each index argument of the function
     on_progress: is told how many samples were added
     Raises NoNumbers when one of the results is NaN or infinite.
     """
     count, devices = len(samples[0]), placed.devices
-    results: list[np.ndarray] = []  # one array, filled batch by batch
+    results: list[np.ndarray] = []  # a single array, filled batch by batch
     filled = 0
     running: list[tuple[int, jax.Array]] = []
 
@@ -80,7 +80,7 @@ def over_samples(
         batch = tuple(np.resize(index[start : start + batch_size], batch_size) for index in samples)
         result = function(placed.graph, placed.variables, placed.source, *devices.shard(batch))
         running.append((min(batch_size, count - start), result))
-        collect(2)  # the device works while the host fetches
+        collect(2)  # the device computes while the host fetches
     collect(0)
     return results[0]
 

@@ -1,7 +1,7 @@
-"""What training, evaluation and prediction ask of an estimator; each estimator has a class that answers.
+"""The interface of estimators to training, evaluation and prediction; each estimator has a class that implements it.
 
-A class names the phases of its training, makes the network, its source (what is put on the devices once) and its
-training data, and reads logits out of it. Networks are split into `trunk` and `heads` (models/variables.py).
+The class defines the phases of training, makes the network, its source (the arrays that are put on the devices once)
+and its training data, and computes logits. Networks are split into `trunk` and `heads` (models/variables.py).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -24,13 +24,13 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
 AT_ONCE = 64
-"""Samples that each device reads at once where whole maps are asked for."""
+"""Samples in a batch on each device when all trajectories of maps are asked for."""
 
 
 class Batch(NamedTuple):
-    """What a step is trained on.
+    """The data of one training step.
 
-    inputs, targets: what the phase's loss takes; weight: [b], 0 for a sample that only fills the batch up
+    inputs, targets: arguments of the phase's loss; weight: [b], 0 for a sample that only pads the batch
     """
 
     inputs: PyTree
@@ -39,7 +39,7 @@ class Batch(NamedTuple):
 
 
 class TrajectorySamples(Protocol):
-    """What a run is trained and validated on, on the host."""
+    """The samples that a run is trained and validated on, on the host."""
 
     dataset: Dataset
 
@@ -54,7 +54,7 @@ class TrajectorySamples(Protocol):
         """Returns the failures of samples."""
 
     def count(self, phase: int, epoch: int) -> int:
-        """Counts what an epoch goes over: the sum of its batches' weights."""
+        """Counts the samples of an epoch: the sum of its batches' weights."""
 
     def steps(self, phase: int, epoch: int = 0) -> int:
         """Counts the batches of an epoch."""
@@ -63,15 +63,15 @@ class TrajectorySamples(Protocol):
         """Yields the batches of an epoch from the first-th on."""
 
     def summary(self) -> str:
-        """Says in a few words what is trained on."""
+        """Describes the training data in a few words."""
 
 
 @dataclass(frozen=True)
 class FrozenTrunk:
-    """How a phase uses a trunk that stays as it is: its features of all samples are computed once.
+    """How a phase uses a frozen trunk: the features of all samples are computed once.
 
-    features: of k samples, [k, f]; takes what `EstimatorKind.logits` does
-    logits:   of features, (graph, variables, features [b, f]) -> [b, 3]
+    features: function that returns the features of k samples, [k, f]; its arguments are those of `EstimatorKind.logits`
+    logits:   function from features to logits, (graph, variables, features [b, f]) -> [b, 3]
     """
 
     features: Callable[[Placed, Samples, int, Progress], Float[np.ndarray, "k f"]]
@@ -79,16 +79,18 @@ class FrozenTrunk:
 
 
 def beside_source(source: PyTree, inputs: tuple, devices: Devices) -> tuple:
-    """Puts the inputs of a step [b, ...] on the devices, a part on each, beside the estimator's source."""
+    """Puts the inputs of a step [b, ...] on the devices, a part on each, and returns them after the estimator's
+    source.
+    """
     return (source, *devices.shard(inputs))
 
 
 @dataclass(frozen=True)
 class Phase:
-    """What the steps of a phase do; hashable, as compiled code depends on it.
+    """Defines the steps of a phase; hashable, because compiled code depends on it.
 
-    trained:      parts of the network whose parameters move, of "trunk" and "heads"
-    loss:         of each sample of a batch, (network, inputs, targets, key) -> [b]; the key is for dropout
+    trained:      parts of the network that are trained, out of "trunk" and "heads"
+    loss:         loss of each sample of a batch, (network, inputs, targets, key) -> [b]; the key is for dropout
     place:        puts inputs on the devices, (source, inputs, devices) -> inputs as `loss` takes them
     frozen_trunk: if there is one, the inputs of a batch are places [b] in the phase's samples, and `loss` takes the
                   features of these samples [b, f]
@@ -101,11 +103,11 @@ class Phase:
 
 
 class EstimatorKind(Protocol):
-    """An estimator: to be subclassed, with an entry in names.py.
+    """An estimator; a subclass needs an entry in names.py.
 
-    phases:           by number: 1 comes first, for the preset's head_epochs, and may be missing; 2 is for its epochs
-    title:            what a message calls it
-    largest_margin:   in units of the robot's limits: margins are not told apart above it; None where there are none
+    phases:           phases by number: 1 lasts the preset's head_epochs and may be missing; 2 lasts its epochs
+    title:            its name in messages
+    largest_margin:   in units of the robot's limits; margins above it are not told apart; None without margins
     reads_whole_maps: whether all trajectories of a map take no longer than one
     sees_images:      whether it is trained on images of map and trajectory, of which a run draws a few (inputs.png)
     """
@@ -131,10 +133,10 @@ class EstimatorKind(Protocol):
         grid: Grid,
         on_progress: Progress = lambda count: None,
     ) -> PyTree:
-        """Returns what is put on the devices of maps, NaN unknown; on_progress: is told of trajectories."""
+        """Returns the arrays to put on the devices for maps, NaN unknown; on_progress: is told of trajectories."""
 
     def data(self, preset: Preset, dataset: Dataset) -> TrajectorySamples:
-        """Returns what of a data set is trained on.
+        """Returns the samples of a data set that are trained and validated on.
 
         Raises InputError when there are no training or no validation samples.
         """
@@ -142,7 +144,7 @@ class EstimatorKind(Protocol):
     def logits(
         self, placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
     ) -> Float[np.ndarray, "k e"]:
-        """Returns the logits of k samples, so many at once; on_progress: is told of samples.
+        """Returns the logits of k samples, `batch_size` at a time; on_progress: is told of samples.
 
         Raises NoNumbers when one of them is NaN or infinite.
         """
@@ -150,7 +152,7 @@ class EstimatorKind(Protocol):
     def of_maps(
         self, placed: Placed, maps: np.ndarray, trajectories: int, on_progress: Progress = lambda count: None
     ) -> tuple[Float[np.ndarray, "m t e"], Float[np.ndarray, "m t e"] | None]:
-        """Returns logits and, if it puts them out, margins in units of the robot's limits of all trajectories of maps.
+        """Returns the logits of all trajectories of maps and, if it has them, margins in units of the robot's limits.
 
         on_progress: is told of samples. Raises as `logits` does.
         """

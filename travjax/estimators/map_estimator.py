@@ -1,6 +1,6 @@
 """The estimator of all trajectories of a map at once ("field"): the hazard field, trained on whole maps.
 
-It has one phase, in which everything is trained, and puts out margins beside logits.
+It has one phase, in which everything is trained, and returns margins as well as logits.
 """
 
 from functools import partial
@@ -28,14 +28,14 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 
 SMALL_ERROR = 0.3
-"""Limits; up to there an error of a margin counts by its square."""
+"""Error of a margin, in limits, up to which it counts by its square."""
 
 MAPS = 4
 """Maps whose hazard fields a device reads at once; a map takes some 100 MB."""
 
 
 def _loss(network: HazardField, inputs, targets, key: Key[Array, ""]) -> Float[Array, " b"]:
-    """Returns the mean over the known trajectories of each map.
+    """Returns the mean loss over the known trajectories of each map.
 
     inputs:  elevation [b, rows, cols] and the stencil of t trajectories
     targets: margins [b, t, e] in units of the limits, known [b, t]
@@ -49,7 +49,7 @@ def _loss(network: HazardField, inputs, targets, key: Key[Array, ""]) -> Float[A
 
 
 def _place(source: MapSource, inputs, devices: Devices):
-    """Puts a part of the maps on each device, the stencil on all; maps of a step are its own, not the source's."""
+    """Puts a part of the maps on each device and the stencil on all; a step has its own maps, not the source's."""
     elevation, stencil = inputs
     return devices.shard(elevation), devices.replicate(stencil)
 
@@ -65,7 +65,7 @@ def map_hazards(
 def hazards(placed: Placed, maps: np.ndarray, on_progress: Progress = lambda count: None) -> Float[np.ndarray, "m t h"]:
     """Returns `map_hazards` of maps [m], on the host; on_progress: is told of maps."""
     count = placed.devices.mesh.size
-    size = min(MAPS, -(-len(maps) // count)) * count  # a single map is not read four times
+    size = min(MAPS, -(-len(maps) // count)) * count  # so that a single map is not computed four times
     return over_samples(map_hazards, placed, (maps,), size, on_progress)
 
 
@@ -78,7 +78,7 @@ class MapEstimator(EstimatorKind):
     reads_whole_maps = True
 
     def create(self, preset: Preset, robot: Robot, seed: int = 0, weights: Weights | None = None) -> HazardField:
-        """Makes the network with random parameters; raises InputError where it is to begin with others."""
+        """Makes the network with random parameters; raises InputError if weights are given."""
         require(weights is None, "weights", preset.weights, '"none": the hazard field begins with random ones')
         return create(preset.field, seed, len(robot.events))
 
@@ -95,7 +95,7 @@ class MapEstimator(EstimatorKind):
         return MapSource.from_maps(heights, robot, actions, grid, preset.elevation_scale)
 
     def data(self, preset: Preset, dataset: Dataset) -> MapSamples:
-        """Returns whole maps."""
+        """Returns the samples of whole maps."""
         return MapSamples(dataset, preset)
 
     def logits(

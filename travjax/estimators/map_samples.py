@@ -1,8 +1,8 @@
-"""What the hazard field is trained on and reads: whole maps, with all their trajectories.
+"""The samples of the hazard field: whole maps, with all their trajectories.
 
-Each step sees a few maps, after some quarter turns in one of the views in which the action space looks like itself
-(footprint.py), corrupted or not, and the trajectories of a few first arcs of each. Labels are the simulator's margins
-on the clean map, so they are exact in every view. All that is random follows from the training seed and the step.
+Each step takes a few maps, rotated by quarter turns and flipped to one of the views that leave the action space as it
+is (footprint.py), some of them corrupted, and the trajectories of a few first arcs of each. Labels are the simulator's
+margins on the clean map, so they are exact in every view. All random numbers follow from the training seed and step.
 """
 
 import itertools
@@ -52,12 +52,12 @@ class MapSource:
         return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
 
     def elevation(self, map_index: Int[Array, " b"]) -> Float[Array, "b rows cols"]:
-        """Returns what the network sees of maps."""
+        """Returns the network's input for maps."""
         return relative(self.heights[map_index], self.elevation_scale)
 
 
 def relative(heights, scale):
-    """Returns heights [b, rows, cols] above that at the centre, in units of a scale."""
+    """Returns heights [b, rows, cols] above the height at the centre, in units of `scale`."""
     middle = heights.shape[-1] // 2
     return (heights - heights[:, middle, middle, None, None]) / scale
 
@@ -76,13 +76,13 @@ class MapSamples:
 
     @cached_property
     def validation(self) -> Samples:
-        """All known trajectories of so many validation maps as make `validation_samples`, one map at least."""
+        """All known trajectories of as many validation maps as make up `validation_samples`, at least of one map."""
         maps = self.dataset.maps_of("validation")
         count = max(self.config.validation_samples // len(self.dataset.actions), 1)
         return every_sample(self.dataset.labels, maps[:: max(len(maps) // count, 1)][:count])
 
     def samples(self, phase: int, epoch: int) -> Samples:
-        """Returns all known trajectories of the training maps; a step sees some of them."""
+        """Returns all known trajectories of the training maps; a step uses some of them."""
         return every_sample(self.dataset.labels, self.maps)
 
     def failed(self, samples: Samples) -> np.ndarray:
@@ -114,9 +114,9 @@ class MapSamples:
         maps, _, weights = batches((self.maps, self.maps), self.config.batch_size, self.config.seed, epoch)
         return maps, weights
 
-    @usual_flags()  # in a thread of its own
+    @usual_flags()  # it runs in a thread of its own
     def prepared(self, maps: np.ndarray, step: int):
-        """Prepares inputs and targets of a step, counted from the first of all, on maps [b]."""
+        """Prepares inputs and targets of a step, counted over the whole training, on maps [b]."""
         data, preset, rng = self.dataset, self.preset, np.random.default_rng((self.config.seed, step))
         views = views_of(data.actions)
         view = views[rng.integers(len(views))]
@@ -142,7 +142,7 @@ class MapSamples:
 
 
 def _batch(prepared: Future, weight: np.ndarray) -> Batch:
-    """Waits for what a step is trained on."""
+    """Waits for the data of a step."""
     inputs, targets = prepared.result()
     return Batch(inputs, targets, weight)
 

@@ -1,4 +1,4 @@
-"""The estimators, one entry each. One of your own is a class as in trajectory_estimator.py, and an entry here."""
+"""The estimators, one entry each. To add one, write a class as in trajectory_estimator.py, and an entry here."""
 
 from dataclasses import dataclass
 from pkgutil import resolve_name
@@ -11,9 +11,9 @@ RESNET, FIELD = "resnet50", "field"
 class Entry:
     """Where an estimator is found.
 
-    kind:   "module:class" of its EstimatorKind (kind.py); it is imported when it is first asked for, so that a command
-            lists the names without Flax
-    folder: of its runs under runs/; its presets lie in presets/, in a folder of its name
+    kind:   "module:class" of its EstimatorKind (kind.py); it is imported at first use, so that a command can list
+            the names without Flax
+    folder: name of the folder of its runs under runs/, and of its presets in presets/
     """
 
     kind: str
@@ -28,4 +28,4 @@ ESTIMATORS = {
     RESNET: Entry("travjax.estimators.trajectory_estimator:TrajectoryEstimator", folder="train"),
     FIELD: Entry("travjax.estimators.map_estimator:MapEstimator", folder="field"),
 }
-"""By the `model` of a preset: of one trajectory at a time, and of all trajectories of a map at once."""
+"""Entries by the `model` of a preset: one trajectory at a time, and all trajectories of a map at once."""

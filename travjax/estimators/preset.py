@@ -20,10 +20,10 @@ SCHEDULES = ("constant", "cosine")
 OPTIMIZERS = ("rmsprop", "adamw")
 
 IMAGENET_WEIGHTS = "imagenet/resnet50_imagenet.npz"
-"""The name of ImageNet weights that may be any: where there is no such file, others are fetched."""
+"""The default ImageNet weights: where this file does not exist, equivalent ones are fetched."""
 
 MOST = 2**31 - 1
-"""Of anything that is counted, and the largest seed."""
+"""Largest value of any count, and of a seed."""
 
 
 def _require_counts(config: object, *names: str, least: int) -> None:
@@ -39,21 +39,21 @@ class TrainingConfig:
 
     A sample is a map and a trajectory; for the hazard field it is a map.
 
-    seed:                 of the subsets, their order, the heads' first values and dropout
-    batch_size:           samples a step
+    seed:                 seed of the subsets, their order, the heads' first values and dropout
+    batch_size:           samples in a step
     head_epochs:          phase 1: epochs of the heads on the features of the frozen trunk
     epochs:               phase 2: epochs of everything
     optimizer:            "rmsprop", or "adamw" with its usual settings
-    learning_rate:        its largest
+    learning_rate:        largest learning rate
     decay, epsilon:       of RMSprop
     max_grad_norm:        gradients longer than this are cut to it; 0 leaves them as they are
     schedule:             of phase 2: "constant", or "cosine" down to zero
     warmup_steps:         steps of phase 2 over which the learning rate rises from zero
-    weight_decay:         times the sum of squares of the heads' kernels, added to the loss; with "adamw" its own decay
+    weight_decay:         factor of the sum of squares of the heads' kernels in the loss; with "adamw" its own decay
     trajectories_per_map: in an epoch; for the hazard field in a step, whole first arcs, as frequent as they are
     failing_per_map:      how many of these fail if as many do
     resample_each_epoch:  a new subset of trajectories each epoch instead of the same one (phase 2)
-    subset_seed:          of the subsets alone, so that runs of other seeds train on the same samples; `seed` if none
+    subset_seed:          seed of the subsets alone, so that runs of other seeds train on the same samples; else `seed`
     validation_samples:   at most this many of the validation maps' balanced subset
     checkpoint_steps:     steps from one checkpoint to the next; there is one after each epoch as well
 
@@ -123,13 +123,13 @@ class TrainingConfig:
 
     @property
     def penalty(self) -> float:
-        """The weight decay that is part of the loss."""
+        """The weight decay that is added to the loss."""
         return 0.0 if self.optimizer == "adamw" else self.weight_decay
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The sample of the test maps that is evaluated, at natural frequency.
+    """The test samples that are evaluated, at natural frequency.
 
     maps: test maps; trajectories_per_map: random ones; 0 for all
     """
@@ -143,16 +143,16 @@ class EvaluationConfig:
 
 @dataclass(frozen=True)
 class Preset:
-    """A training run.
+    """The settings of a training run.
 
-    model:           the estimator, one of ESTIMATORS
-    robot:           a preset or a .toml file
+    model:           name of the estimator, one of ESTIMATORS
+    robot:           name of a preset, or a .toml file
     weights:         file of the trunk's first weights, here or under TRAVJAX_DATA; "none" for random ones; where there
                      is no file of the name IMAGENET_WEIGHTS, others are fetched
     elevation_scale: metres that count as 1 in the elevation channel
 
-    The rest are the tables of the file: trunk and heads are those of the ResNet, field is the hazard field's, and so is
-    corruption, what it sees of its training maps.
+    The rest are the tables of the file: trunk and heads belong to the ResNet; field and corruption, which alters the
+    training maps, to the hazard field.
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -188,8 +188,8 @@ class Preset:
 def find_weights(name: str) -> Path | None:
     """Returns the file of a preset's `weights`, None for "none".
 
-    IMAGENET_WEIGHTS that are neither here nor under TRAVJAX_DATA are taken from the cache, or fetched.
-    Raises InputError when there is no such file, and it is not to be fetched.
+    If IMAGENET_WEIGHTS is neither here nor under TRAVJAX_DATA, weights are taken from the cache or fetched.
+    Raises InputError when the file does not exist, and for IMAGENET_WEIGHTS only when none can be fetched either.
     """
     if name == "none":
         return None

@@ -35,7 +35,7 @@ def _loss(network: Estimator, inputs, failed: Float[Array, "b e"], key: Key[Arra
 def _loss_of_heads(
     network: Estimator, features: Float[Array, "b f"], failed: Float[Array, "b e"], key: Key[Array, ""]
 ) -> Float[Array, " b"]:
-    """Returns that of the heads on the trunk's features."""
+    """Returns the same loss for the heads alone, on the trunk's features."""
     return _entropy(network.heads(features, key), failed)
 
 
@@ -69,14 +69,14 @@ def sample_features(
 
 @partial(jax.jit, static_argnames="graph")
 def feature_logits(graph: nnx.GraphDef, variables: Variables, features: Float[Array, "b f"]) -> Float[Array, "b e"]:
-    """Returns the logits of features of the trunk."""
+    """Returns the logits for the trunk's features."""
     return merge_model(graph, variables).heads(features)
 
 
 def features_of(
     placed: Placed, samples: Samples, batch_size: int, on_progress: Progress = lambda count: None
 ) -> Float[np.ndarray, "k f"]:
-    """Returns the trunk's features of k samples; arguments of `EstimatorKind.logits`."""
+    """Returns the trunk's features of k samples; the arguments are those of `EstimatorKind.logits`."""
     return over_samples(sample_features, placed, samples, batch_size, on_progress)
 
 
@@ -102,7 +102,7 @@ class TrajectoryEstimator(EstimatorKind):
         grid: Grid,
         on_progress: Progress = lambda count: None,
     ) -> ImageSource:
-        """Returns the maps and the drawn trajectories."""
+        """Returns the maps and the drawn channels of all trajectories."""
         return ImageSource.from_maps(heights, robot, actions, grid, preset.elevation_scale, on_progress)
 
     def data(self, preset: Preset, dataset: Dataset) -> TrajectorySamples:

@@ -33,7 +33,7 @@ class TrajectorySamples:
         """Returns the training samples of an epoch; phase 1 has the same ones in all epochs."""
         number = 0 if phase == 1 else epoch + 1
         if number not in self._kept:
-            # Those that steps are counted by stay; others are forgotten, a draw of a large data set takes a second.
+            # Those from which steps are counted are kept, others dropped: drawing from a large data set takes a second.
             counted = {kept: samples for kept, samples in self._kept.items() if kept < 2}
             self._kept = counted | {number: self._sampler.epoch(number)}
         return self._kept[number]
@@ -61,11 +61,11 @@ class TrajectorySamples:
         return -(-self.count(phase, epoch) // self.config.batch_size)
 
     def batches(self, phase: int, epoch: int, first: int = 0) -> Iterator[Batch]:
-        """Yields the batches of an epoch from the first-th on, in an order of the epoch's own.
+        """Yields the batches of an epoch from the first-th on, each epoch in its own order.
 
         inputs:  maps [b] and trajectories [b]; in phase 1 places in `samples` [b]
         targets: failures [b, events]
-        The samples that fill up the last batch have weight 0, but count in its batch statistics.
+        The samples that pad the last batch have weight 0, but count in its batch statistics.
         """
         samples = self.samples(phase, epoch)
         failed, places = self.failed(samples), np.arange(len(samples[0]))
