@@ -49,13 +49,13 @@ from travjax.runs.predictor import Predictor
 SYNTHETIC, REAL, BOTH = GROUNDS = ("synthetic", "real", "both")
 
 SITES = "real"
-"""The preset of the real ground unless another is given."""
+"""Name of the preset of real ground that is used unless another is given."""
 
 SEED = 20_251_125
 """The seed of the test maps; the validation maps have the next one.
 
-A data set draws its terrain seeds from its own seed and size together, so that maps of another seed or size are other
-maps. Presets have seed 0: none of their maps is among these, nor is a test map among the validation maps.
+A data set draws its terrain seeds from its own seed and size together, so another seed or size gives different maps.
+Presets have seed 0, so training maps, validation maps and test maps are all different.
 """
 
 DESCRIPTION = (
@@ -163,7 +163,7 @@ def _load(option: str, source: Path | None, model: str) -> Predictor:
 
 
 def _sites(given: str | None, ground: str) -> SitesConfig | None:
-    """Returns the sites to compare on, or says in a line why the experiment's are not at hand, and returns None."""
+    """Returns the sites to compare on, or prints in a line why they are not available and returns None."""
     if ground == SYNTHETIC:
         return None
     try:
@@ -208,12 +208,12 @@ def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict
 
 @dataclass(frozen=True)
 class Part:
-    """What is said of one kind of ground.
+    """The part of the results on one kind of ground.
 
     text:    paragraphs of the report
-    tables:  by title
-    numbers: for results.json
-    files:   that were written, figures among them
+    tables:  tables by title
+    numbers: values for results.json
+    files:   files that were written, including figures
     """
 
     text: list[str]
@@ -306,10 +306,10 @@ def _write(parts: Sequence[Part], out: Path) -> None:
 def _points(
     f1: Mapping[str, Mapping[str, float]], seconds: Mapping[str, float]
 ) -> dict[str, tuple[float, float, float]]:
-    """Returns (seconds a map, F1 on clean maps, F1 at the largest noise) of each way.
+    """Returns (seconds a map, F1 on clean maps, F1 at the largest noise) of each method.
 
-    The simulators are drawn with the best filter, the time of which is left out: without one they would look worse on
-    the noisy map than they have to be.
+    The simulators are drawn with the best filter, whose time is not counted: without a filter they would look worse on
+    the noisy map than they need to be.
     """
     noisiest = [name for name in CORRUPTIONS if name.startswith("noise")][-1]
     points = {}

@@ -1,4 +1,4 @@
-"""What the experiments share: how they start, where their presets are, and the report that they end with."""
+"""Shared by the experiments: how they start, where their presets are, and the report that they write at the end."""
 
 import argparse
 from collections.abc import Callable, Sequence
@@ -8,7 +8,7 @@ from travjax.entry import Parser, guarded, use_compilation_cache
 from travjax.files import save_text
 
 GOES_ON = "the same command goes on from there"
-"""What an experiment says when it is stopped."""
+"""Message of an experiment that is stopped."""
 
 Piece = str | Path
 """A part of a report: text, or a figure."""
@@ -22,7 +22,7 @@ def parser(name: str, description: str) -> Parser:
 def launch(
     options: argparse.ArgumentParser, run: Callable[[argparse.Namespace], object], argv: Sequence[str] | None = None
 ) -> int:
-    """Parses the words and runs the experiment; returns the exit code, 2 for bad input, which is said in one line."""
+    """Parses the options and runs the experiment; returns the exit code, 2 for bad input, reported in one line."""
 
     def work() -> None:
         arguments = options.parse_args(argv)
@@ -33,7 +33,7 @@ def launch(
 
 
 def write_report(folder: Path, title: str, pieces: Sequence[Piece]) -> Path:
-    """Writes report.md: Markdown text, and figures of the folder, which are named after their files."""
+    """Writes report.md: Markdown text, and figures in the folder, with captions after the file names."""
     shown = [piece if isinstance(piece, str) else _figure(piece.relative_to(folder)) for piece in pieces]
     return save_text(folder / "report.md", "\n\n".join([f"# {title}", *shown]) + "\n")
 
@@ -43,5 +43,5 @@ def _figure(path: Path) -> str:
 
 
 def verbatim(text: str, language: str = "") -> str:
-    """Returns a text as it stands, for a report."""
+    """Returns a text as a code block of a report."""
     return f"```{language}\n{text}\n```"

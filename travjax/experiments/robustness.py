@@ -1,6 +1,6 @@
-"""Simulators and estimators on the same maps, clean and as sensors see them; labels are always those of the clean map.
+"""Simulators and estimators on the same maps, clean and as sensors see them; labels always come from the clean map.
 
-A method turns maps [n, rows, cols] into scores of failure [n, t, k], of which 0.5 and more says "fails".
+A method turns maps [n, rows, cols] into failure scores [n, t, k]; a score of 0.5 or more means "fails".
 """
 
 from collections.abc import Callable, Sequence
@@ -30,7 +30,7 @@ Fails = Float[np.ndarray, "*m k"]
 Progress = Callable[[int], object]
 
 NOISES = (0.01, 0.02, 0.05)
-"""Standard deviations of the noise in metres."""
+"""Standard deviations of the noise that is added, in metres."""
 
 MISSING = (0.05, 0.2)
 """Shares of nodes that are missing."""
@@ -38,7 +38,7 @@ MISSING = (0.05, 0.2)
 CLEAN, COARSE = "none", "0.125 m"
 
 GAUSSIANS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
-"""Standard deviations in nodes that the simulator's map may be smoothed by."""
+"""Standard deviations, in nodes, of the Gaussian filters for the simulator's map."""
 
 
 Corruption = Callable[[Maps, np.random.Generator], Maps]
@@ -58,23 +58,23 @@ CORRUPTIONS: dict[str, Corruption] = {
     **{f"{share:.0%} missing": _missing(share) for share in MISSING},
     COARSE: lambda maps, rng: sensor_noise.upsampled(maps),
 }
-"""What is done to maps, by name: each of them is seen as a sensor may see it, with all nodes known."""
+"""Corruptions of maps by name: each shows the maps as a sensor may see them, with all nodes known."""
 
 FILTERS: dict[str, Callable[[Maps], Maps]] = {
     "no filter": lambda maps: maps,
     "median 3 x 3": sensor_noise.median,
     **{f"Gaussian {nodes:g}": partial(sensor_noise.smoothed, deviation=nodes) for nodes in GAUSSIANS},
 }
-"""What may be done to a corrupted map before it is simulated; deviations in nodes."""
+"""Filters by name that may be applied to a corrupted map before it is simulated; deviations in nodes."""
 
 
 @dataclass(frozen=True)
 class BenchmarkMaps:
-    """Clean maps and what the simulator says of them.
+    """Clean maps and their labels by the simulator.
 
     heights: [n, rows, cols] metres, none unknown: what was unknown has the height of the nearest known node
-    known:   [n, t] whether a trajectory touches known ground alone; the others count in no score
-    failed:  [n, t, k] by the robot's k events
+    known:   [n, t] whether a trajectory touches only known ground; the others count in no score
+    failed:  [n, t, k] for the robot's k events
     margins: [n, t, k] metres or radians, NaN where unknown
     """
 
@@ -104,7 +104,7 @@ class BenchmarkMaps:
 
     @staticmethod
     def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
-        """Labels windows of real maps; heights: NaN unknown."""
+        """Labels windows of real maps; heights: [n, rows, cols] metres, NaN unknown."""
         return BenchmarkMaps._from_batch(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
 
     @staticmethod
@@ -114,17 +114,17 @@ class BenchmarkMaps:
         return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
 
     def seen(self, name: str, seed: int) -> Maps:
-        """Returns the maps with a corruption of CORRUPTIONS, the same each time."""
+        """Returns the maps with one of CORRUPTIONS, the same each time for a seed."""
         rng = np.random.default_rng((seed, list(CORRUPTIONS).index(name)))
         return np.asarray(CORRUPTIONS[name](self.heights, rng), np.float32)
 
     def simulated(self, maps: Maps) -> Fails:
-        """Returns what the simulator says of maps: 1 fails, 0 does not."""
+        """Returns the simulator's verdict on maps: 1 where a trajectory fails, else 0."""
         margins = simulate(maps, self.robot, self.actions, grid=self.grid).events()
         return (np.asarray(margins) > np.asarray(self.robot.limits, np.float32)).astype(np.float32)
 
     def best_filter(self, maps: Maps, on_progress: Progress = lambda count: None) -> str:
-        """Returns the one of FILTERS after which the simulator has the largest F1 on these corrupted maps."""
+        """Returns the name in FILTERS of the filter that gives the simulator the largest F1 on these corrupted maps."""
         scores = {}
         for name, smooth in FILTERS.items():
             scores[name] = self.scores(self.simulated(smooth(maps)))[OVERALL].f1
@@ -145,9 +145,9 @@ def of_sites(
     grid: Grid,
     on_progress: Progress = lambda count: None,
 ) -> dict[str, BenchmarkMaps]:
-    """Returns the windows of each site by its name: all that are known well enough, or `most` drawn at random.
+    """Returns the windows of each site by name: all that are sufficiently known, or `most` drawn at random.
 
-    config: its splits and turns are left aside; on_progress: is told of windows that were read
+    config: its splits and turns are ignored; on_progress: is told of windows that were read
     Raises InputError when a file is missing, cannot be read or leaves no window.
     """
     whole = (replace(site, split="test", test_strip=(), validation_strip=()) for site in config.site)
@@ -161,12 +161,12 @@ def of_sites(
 
 
 def by_margins(margins: Float[np.ndarray, "n t k"], robot: Robot) -> Fails:
-    """Returns scores of regressed margins, which are 0.5 at the robot's limits."""
+    """Converts regressed margins to scores, which are 0.5 at the robot's limits."""
     return np.clip(margins / np.asarray(robot.limits, np.float32) / 2, 0, 1)
 
 
 def of_samples(predictor: Predictor, maps: Maps, samples: Samples, on_progress: Progress = lambda count: None) -> Fails:
-    """Returns probabilities of an estimator for samples [m] of maps: [m, k]; on_progress: is told of samples."""
+    """Returns an estimator's probabilities for samples [m] of maps: [m, k]; on_progress: is told of samples."""
     devices = Devices.all()
     placed = Placed.from_network(predictor.network, devices.replicate(predictor.run.source(maps)), devices)
     return probabilities(predictor.run.kind.logits(placed, samples, 64 * devices.mesh.size, on_progress))

@@ -1,4 +1,4 @@
-"""Scores of the comparison: the names of the methods, what each reaches on a ground, its tables and figures."""
+"""Scores of the comparison: names of the methods, their results on each kind of ground, tables and figures."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -39,7 +39,7 @@ IN_FIGURE = {
     "Gaussian 1.25": "simulator after a Gaussian of 1.25 nodes",
     HAZARD: HAZARD,
 }
-"""Methods of ON_SITES that the figure of real ground shows, and their names in it."""
+"""Methods of ON_SITES that the figure of real ground shows, with their names in the legend."""
 
 RECALL = 0.97
 """The recall for which a threshold is chosen on validation maps."""
@@ -49,7 +49,7 @@ SiteScores = dict[str, dict[str, dict[str, Confusion]]]
 
 
 def best_filters(validation: BenchmarkMaps, seed: int) -> dict[str, str]:
-    """Returns for every corruption the filter after which the simulator is best on the validation maps."""
+    """Returns for every corruption the filter that is best for the simulator on the validation maps."""
     with progress.bar("filters", len(CORRUPTIONS) * len(FILTERS), "filter") as bar:
         return {name: validation.best_filter(validation.seen(name, seed + 1), bar.update) for name in CORRUPTIONS}
 
@@ -63,7 +63,7 @@ def compare(
     chosen: Mapping[str, str],
     seed: int,
 ) -> dict:
-    """Returns for every corruption its filter, and every method's confusions and average precisions."""
+    """Returns for every corruption its filter and the confusions and average precisions of every method."""
     results: dict[str, dict] = {}
     drawn, events = _drawn(test, samples, seed), test.robot.event_names
     methods = 3 + (resnet is not None)
@@ -89,12 +89,12 @@ def compare(
 
 
 def _margins(margins: np.ndarray | None) -> np.ndarray:
-    assert margins is not None  # the hazard field has them
+    assert margins is not None  # the hazard field has margins
     return margins
 
 
 def _drawn(test: BenchmarkMaps, samples: int, seed: int) -> Samples:
-    """Draws random trajectories of all maps, for what is too slow for all of them."""
+    """Draws random trajectories of all maps, for methods that are too slow for all of them."""
     rng = np.random.default_rng(seed)
     maps, trajectories = test.failed.shape[:2]
     places = np.sort(rng.choice(maps * trajectories, min(samples, maps * trajectories), replace=False))
@@ -121,7 +121,7 @@ def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predic
 
 
 def on_sites(real: Mapping[str, BenchmarkMaps], field: Predictor, seed: int) -> dict[str, SiteScores]:
-    """Returns by site and corruption the confusions of the simulator after each filter, and of the hazard field."""
+    """Returns by site and corruption the confusions of the simulator with each filter, and of the hazard field."""
     with progress.bar("sites", len(real) * len(CORRUPTIONS) * len(ON_SITES), "method") as bar:
         return {site: _of_site(ground, field, seed, bar.update) for site, ground in real.items()}
 
@@ -142,7 +142,7 @@ def _of_site(ground: BenchmarkMaps, field: Predictor, seed: int, on_progress: Pr
 
 
 def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
-    """Returns F1 of every method of METHODS on every corruption, as `comparison.compare` returns them."""
+    """Returns F1 of every method in METHODS on every corruption, from the results of `compare`."""
     return {
         method: {name: one["methods"][method]["confusion"][OVERALL].f1 for name, one in results.items()}
         for method in METHODS
@@ -151,13 +151,13 @@ def f1_of(results: Mapping[str, dict]) -> dict[str, dict[str, float]]:
 
 
 def f1_of_site(site: SiteScores, chosen: Mapping[str, str]) -> dict[str, dict[str, float]]:
-    """Returns F1 of every method of ON_SITES and of FILTERED on every corruption; chosen: each one's filter."""
+    """Returns F1 of the methods in ON_SITES and of FILTERED on every corruption; chosen: filter by corruption."""
     f1 = {method: {name: of[method][OVERALL].f1 for name, of in site.items()} for method in ON_SITES}
     return f1 | {FILTERED: {name: f1[smooth][name] for name, smooth in chosen.items()}}
 
 
 def shown(value: float) -> str:
-    """Shows a share with three digits, or a dash where it is undefined."""
+    """Formats a share with three digits, or as a dash where it is undefined."""
     return "-" if math.isnan(value) else f"{value:.3f}"
 
 
@@ -184,9 +184,9 @@ def _quality(method: str, event: str, confusion: Confusion, precision: float) ->
 
 
 def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> str:
-    """Returns a table of F1 on real ground: for each corruption a row a site; below it filters and who is ahead.
+    """Returns a table of F1 on real ground, one row for each corruption and site; filters and the best method follow.
 
-    sites: scores by name; chosen: of each corruption the filter of FILTERED
+    sites: scores by name; chosen: filter of FILTERED by corruption
     """
     plain, *filters = FILTERS
     heads = {plain: SIMULATOR} | {name: name for name in (*filters, HAZARD, MARGINS)} | {FILTERED: "best filter"}
@@ -204,7 +204,7 @@ def sites_table(sites: Mapping[str, SiteScores], chosen: Mapping[str, str]) -> s
 
 
 def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
-    """Says on how many sites the field is above the simulator after the best filter; f1: by site and method."""
+    """Says on how many sites the field is better than the simulator with the best filter; f1: by site and method."""
     counts = []
     for name in CORRUPTIONS:
         measured = [of for of in f1.values() if not math.isnan(of[HAZARD][name])]
@@ -214,9 +214,9 @@ def _where_better(f1: Mapping[str, Mapping[str, Mapping[str, float]]]) -> str:
 
 
 def robustness_figure(f1: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Draws F1 of methods against the noise of the map, and on maps that are corrupted otherwise.
+    """Draws F1 of methods against the noise of the map, and on maps with other corruptions.
 
-    f1: of each method by the name of a corruption: "none", "noise 2 cm", or another
+    f1: F1 by method and by name of a corruption: "none", "noise 2 cm", or another
     """
     figure = Figure(figsize=(12.5, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True, width_ratios=(1, 1.3))
@@ -244,10 +244,10 @@ OKABE_ITO = ("#000000", "#0072B2", "#E69F00", "#D55E00", "#009E73", "#CC79A7")
 
 
 def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: Mapping[str, str]) -> Figure:
-    """Draws F1 of methods on each site: against the noise of the map above, on maps that are corrupted otherwise below.
+    """Draws F1 of methods on each site: against the noise of the map above, with other corruptions below.
 
-    f1:      by site, method and corruption: "none", "noise 2 cm", or another
-    methods: those to draw, and what they are called; each has a colour, a marker and a line of its own
+    f1:      F1 by site, method and corruption: "none", "noise 2 cm", or another
+    methods: methods to draw, with their names; each has its own colour, marker and line
     """
     names = list(next(iter(next(iter(f1.values())).values())))
     clean, noisy = names[0], [name for name in names if name.startswith("noise")]
@@ -278,7 +278,7 @@ def sites_figure(f1: Mapping[str, Mapping[str, Mapping[str, float]]], methods: M
 def quality_figure(points: Mapping[str, tuple[float, float, float]]) -> Figure:
     """Draws F1 against the time for all trajectories of a map.
 
-    points: of each way (seconds a map, F1 on clean maps, F1 at the largest noise)
+    points: by method (seconds a map, F1 on clean maps, F1 at the largest noise)
     """
     figure = Figure(figsize=(9, 5.6), layout="constrained")
     ax = figure.subplots()

@@ -1,4 +1,4 @@
-"""Built-in sites that stand in for real maps where there are none: rock fields, split and read as real ones are."""
+"""Built-in sites that replace real maps where there are none: rock fields, split and read like real sites."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DESCRIPTION = "stand_in.toml"
-"""The stand-in sites and how they are split, beside the file of the real ones."""
+"""Name of the file beside that of the real sites that lists the stand-in sites and their splits."""
 
 FOLDER = "stand_ins"
-"""Where an experiment keeps their rasters, in its own folder."""
+"""Name of the folder, within that of an experiment, that holds the rasters."""
 
 SPACING = 0.0625
 """Metres between the nodes of the rasters."""
@@ -31,8 +31,8 @@ SPACING = 0.0625
 class StandIns:
     """The stand-in sites of an experiment.
 
-    sites:  what a data set is made from: stride, gap and so on of the real sites
-    folder: of the rasters
+    sites:  configuration of the data set, with stride, gap and so on of the real sites
+    folder: folder of the rasters
     """
 
     sites: SitesConfig
@@ -52,13 +52,13 @@ class StandIns:
         return StandIns(replace(config, site=placed), folder)
 
     def in_place_of_real(self, config: TransferConfig) -> TransferConfig:
-        """Returns an experiment on them; of maps it shows those of the last site."""
+        """Returns the experiment with these sites in place of the real ones; its figure shows maps of the last site."""
         sites = Path(config.sites).with_name(DESCRIPTION)
         return replace(config, sites=str(sites), shown=self.sites.site[-1].group)
 
     @property
     def sentence(self) -> str:
-        """Says what they are, for those who read results."""
+        """One sentence that tells readers of results what the sites are."""
         names = " and ".join(Path(site.file).stem for site in self.sites.site)
         return (
             f"Built-in stand-in sites take the place of real maps: {names}, made by travjax (docs/stand-in-sites.md). "
@@ -97,7 +97,7 @@ class StandIns:
 
 
 def _draw_strip(ax: "Axes", split: str, side: str, metres: float, east: float, north: float) -> None:
-    """Marks a strip of a site of so many metres to the east and to the north, and says what it is for."""
+    """Marks and labels the strip of a split on a site of `east` x `north` metres."""
     along_x, first = side in ("east", "west"), side in ("south", "west")
     length, across = (east, north) if along_x else (north, east)
     middle, inner = (metres / 2, metres) if first else (length - metres / 2, length - metres)
@@ -109,10 +109,10 @@ def _draw_strip(ax: "Axes", split: str, side: str, metres: float, east: float, n
 
 
 def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> StandIns | None:
-    """Returns the stand-in sites if asked for, or if neither a data set nor any file of the real sites is there.
+    """Returns the stand-in sites if asked for, or if neither a data set nor any file of the real sites exists.
 
     real: TOML file of the real sites; out: folder of the experiment; data: data set that is given
-    Raises InputError where a data set is given beside them, and where real maps would go on with what stand-ins began.
+    Raises InputError where a data set is given as well, and where real maps would continue a run on stand-ins.
     """
     put_back(out / DATA)
     begun = (out / FOLDER).exists()
@@ -127,7 +127,7 @@ def chosen_stand_ins(real: Path, out: Path, asked: bool, data: Path | None) -> S
 
 
 def _none_is_there(real: Path) -> bool:
-    """Tells whether no file of the real sites is there, and stand-ins are described beside them."""
+    """Tells whether none of the real sites' files exists while stand-ins are described beside them."""
     described = (real.parent / DESCRIPTION).is_file()
     return described and not any(_is_there(site.file) for site in SitesConfig.load(real).site)
 

@@ -32,7 +32,7 @@ DESCRIPTION = (
 
 EVALUATION = ("predictions", "precision_recall", "reliability")
 TRAINING = ("training", "inputs")
-"""Figures in the order of the report."""
+"""Names of figures in the order of the report."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Trains as far as that is not done yet, evaluates, and writes the report."""
+    """Trains unless that is done, evaluates, and writes the report."""
     path = find_preset(arguments.preset, RESNET)
     wanted = options.run_of(Preset.load(path), arguments)
     folder = arguments.out or Path("runs/synthetic") / path.stem
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]:
-    """Returns texts and figures of the report."""
+    """Returns the texts and figures of the report."""
     epochs = [row for row in read_rows(folder / "metrics.jsonl") if type(row.get("samples_per_s")) in (int, float)]
     steps = [f"{row['step']:,} steps, {row['samples_per_s']:,.0f} samples/s in the last epoch" for row in epochs[-1:]]
     trained = (
@@ -89,7 +89,7 @@ def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]
 
 
 def _beside_the_paper(wanted: Run, ours: Confusion) -> list[str]:
-    """Returns one line over all events, if robot and action space are the paper's."""
+    """Returns one line on all events pooled, if robot and action space are the paper's."""
     if not as_in_paper(wanted.robot, wanted.actions):
         return []
     shown = lambda value: "-" if math.isnan(value) else f"{value:.3f}"

@@ -36,7 +36,7 @@ COLUMNS = {
 }
 
 TOGETHER = 32
-"""Maps at once, where it is more than one."""
+"""Maps at once, where several are simulated together."""
 
 SEQUENTIAL, NETWORK = "sequential simulator", "network"
 PAPER = {f"paper: {SEQUENTIAL}": ("Intel i5-6500", 58.0), f"paper: {NETWORK}": ("NVIDIA GTX 1050", 17.0)}
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> None:
 def measured(
     robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
 ) -> list[dict]:
-    """Measures each way to all trajectories of a map on the device at hand, with progress bars; returns the rows."""
+    """Measures each method on all trajectories of a map on this device, with progress bars; returns the rows."""
     with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
         row = simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
@@ -116,7 +116,7 @@ def measured(
 
 
 def _of_paper() -> list[dict]:
-    """Returns rows of what the paper says."""
+    """Returns the rows of the paper's times."""
     sequential = next(seconds for _, seconds in PAPER.values())
     trajectories = len(ActionSpace())
     return [
@@ -137,7 +137,7 @@ def _row(what: str, device: str, seconds: float, trajectories: int, sequential: 
 
 
 def _device() -> str:
-    """Names what JAX runs on."""
+    """Returns the name of the device that JAX runs on."""
     devices = jax.devices()
     if devices[0].platform == "cpu":
         return f"{simulator_benchmark.processor()}, {os.cpu_count()} cores"

@@ -85,7 +85,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Trains what is not trained yet, and writes the results."""
+    """Trains the runs that are not trained yet, and writes the results."""
     named = Path(arguments.preset).suffix != ".toml"
     suffix = f"_{arguments.model}" if named and arguments.model != RESNET else ""
     path = find_preset(arguments.preset + suffix, "transfer")
@@ -107,7 +107,9 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     base = _base(path.parent / user_path(config.synthetic), arguments)
     synthetic = arguments.synthetic or out / "synthetic"
     data = _data(sites, arguments.data, base, out, stand_ins)
-    transfer = Transfer(config, base, synthetic, data, out, devices)  # refuses what does not fit before hours of work
+    transfer = Transfer(
+        config, base, synthetic, data, out, devices
+    )  # raises where something does not fit, before hours of work
     if not arguments.synthetic:
         _train_synthetic(base, synthetic, devices)
     say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
@@ -115,7 +117,7 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
 
 
 def _require_same(out: Path, config: TransferConfig) -> None:
-    """Keeps the configuration in the folder, and refuses a folder with another one; its FILES may have moved."""
+    """Saves the configuration in the folder; raises InputError if it holds another, except for moved FILES."""
     path = out / "config.json"
     if path.exists() and not _is_of(path, config):
         raise InputError(
@@ -135,7 +137,7 @@ def _is_of(path: Path, config: TransferConfig) -> bool:
 
 
 def _base(preset: Path, arguments: argparse.Namespace) -> Run:
-    """Returns the run of the synthetic model: that of the folder given, else that of the experiment."""
+    """Returns the run of the synthetic model: that of the given folder, else that of the experiment."""
     if not arguments.synthetic:
         return options.run_of(Preset.load(preset), arguments)
     for name, default in arguments.of_synthetic.items():
@@ -145,18 +147,18 @@ def _base(preset: Path, arguments: argparse.Namespace) -> Run:
 
 
 def _train_synthetic(base: Run, folder: Path, devices: Devices) -> None:
-    """Trains and evaluates the synthetic model as far as that is not done."""
+    """Trains and evaluates the synthetic model unless that is done."""
     fit(base, folder, devices, resume=True)
     if not (folder / TABLES).exists():
         evaluate_run(folder)
 
 
 TABLES = "evaluation/tables.txt"
-"""Tables of `travjax evaluate` in the folder of a training run."""
+"""File of the tables of `travjax evaluate` in the folder of a training run."""
 
 
 def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: StandIns | None) -> Dataset:
-    """Returns the data set of real maps: the one given, else the experiment's, made if it is not there yet."""
+    """Returns the data set of real maps: the one given, else the experiment's, made if it does not exist yet."""
     if given:
         return dataset.load(given)
     put_back(out / DATA)
@@ -223,14 +225,14 @@ MEANING = (
 
 
 def _samples(transfer: Transfer) -> str:
-    """Says what an epoch is trained on."""
+    """Describes the training samples of an epoch."""
     if transfer.base.kind.reads_whole_maps:
         return f"all trajectories of {len(transfer.dataset.maps_of('train')):,} windows"
     return f"{TrajectorySamples(transfer.dataset, transfer.config.training).count(2, 0):,} samples"
 
 
 def _maps_figure(transfer: Transfer) -> Figure:
-    """Draws the synthetic model before and after training on real maps, over the truth, on windows of one site."""
+    """Draws predictions before and after training on real maps, above the labels, on windows of one site."""
     config, data, base = transfer.config, transfer.dataset, transfer.base
     evaluator = Evaluator.from_run(base, data, transfer.devices)
     shown = evaluator.to_show(config.shown_maps, config.shown)

@@ -1,7 +1,7 @@
 """The transfer experiment: what pre-training is worth on real maps (SPEC section 11, the second half of the paper).
 
 Runs that differ in their first weights alone, the arms, train on the same samples of real maps with the same settings,
-and are scored after every epoch on held-out ground. With `head_epochs` the trunks stay frozen and each one's features
+and are scored after every epoch on held-out ground. With `head_epochs` the trunks stay frozen, and the features of each
 are computed once for all seeds; with `epochs` everything is trained, as in the paper.
 """
 
@@ -29,27 +29,27 @@ from travjax.runs.run_log import read_rows
 from travjax.training.trainer import Trainer
 
 ARMS = ("random", "ImageNet", "ImageNet + synthetic")
-"""What the runs begin with, in the paper's order."""
+"""First weights of the runs, in the paper's order."""
 
 SCRATCH, IMAGENET, SYNTHETIC = ARMS
 
 FIELD_ARMS = (SCRATCH, "synthetic")
-"""Likewise where no trunk is frozen in a first phase, as in the hazard field: there are no ImageNet weights for it."""
+"""First weights where no phase freezes the trunk, as for the hazard field, which has no ImageNet weights."""
 
 
 @dataclass(frozen=True)
 class TransferConfig:
-    """Describes the experiment, but for the robot, the network and its inputs, which are those of the synthetic model.
+    """Describes the experiment; robot, network and inputs are those of the synthetic model.
 
     sites:      TOML file of the real maps, as `travjax dataset --sites` reads it
     synthetic:  preset that trains the synthetic model
-    seeds:      of the runs of each arm: order, dropout, first weights that are random
+    seeds:      seed of each run of an arm, for the order of samples, dropout and random first weights
     shown:      held-out site in the figure of maps; its licence must allow that
     shown_maps: number of its windows there
     training:   `head_epochs` for frozen trunks or `epochs` for all of it, not both
-    trajectories_per_map: random known ones of each held-out window that are scored, 0 for all
+    trajectories_per_map: number of random known trajectories of each held-out window that are scored, 0 for all
 
-    Files are named from the folder of the preset. Raises InputError that names field, value and what is allowed.
+    File names are relative to the folder of the preset. Raises InputError that names field, value and what is allowed.
     """
 
     sites: str = "../sites/real.toml"
@@ -107,18 +107,18 @@ class Transfer:
 
     @property
     def arms(self) -> tuple[str, ...]:
-        """What the runs begin with; the synthetic model is the last."""
+        """The first weights of the runs; the synthetic model is the last."""
         return ARMS if 1 in self.base.kind.phases else FIELD_ARMS
 
     def run_of(self, arm: str, seed: int) -> Run:
-        """Returns what a run is made from: the synthetic model's settings, trained as the experiment says."""
+        """Returns the run of an arm: the synthetic model's settings with the experiment's training settings."""
         preset = self.base.preset
         weights = {SCRATCH: "none", IMAGENET: preset.weights}.get(arm, f"{self.synthetic}")
         training = replace(self.config.training, seed=seed, subset_seed=self.config.training.sampling_seed)
         return replace(self.base, preset=replace(preset, weights=weights, training=training))
 
     def place_of(self, arm: str, seed: int) -> Path:
-        """Returns the folder of a run, which is one of `travjax train`."""
+        """Returns the folder of a run, in the form that `travjax train` writes."""
         return self.folder / "runs" / f"{_name(arm)}_{seed}"
 
     def rows(self, arm: str, seed: int) -> list[dict]:
@@ -194,11 +194,11 @@ class Transfer:
         return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, events, rngs=rngs))
 
     def _features_file(self, arm: str) -> Path:
-        """Names the file of an arm's features, for its other seeds and for a run that goes on."""
+        """Returns the path of an arm's features, which its other seeds and a resumed run use again."""
         return self.folder / "features" / f"{_name(arm)}.npz"
 
     def _kept_features(self, arm: str) -> dict[str, np.ndarray] | None:
-        """Reads the features of an arm's frozen trunk on this data set; None where they are to be computed."""
+        """Reads the features of an arm's frozen trunk on this data set; None where they have yet to be computed."""
         kept = _read_features(self._features_file(arm)) if self.config.frozen else {}
         return kept if str(kept.pop("dataset", None)) == self.dataset.fingerprint else None
 
@@ -208,7 +208,7 @@ def _read_features(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return dict(file)
-    except Exception:  # NumPy and zipfile raise all sorts over a damaged file
+    except Exception:  # NumPy and zipfile raise many kinds of errors for a damaged file
         return {}
 
 
@@ -227,7 +227,9 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
 
 
 def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
-    """Returns the rows of all runs by arm and seed, trained one after the other; on_run is told which one begins."""
+    """Returns the rows of all runs by arm and seed, trained one after the other; on_run is called with each one as it
+    begins.
+    """
     results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
     for arm in transfer.arms:
         for seed in transfer.config.seeds:

@@ -1,7 +1,7 @@
-"""Scores of the transfer experiment: of every arm, seed, epoch and held-out site, in tables, JSON and a figure.
+"""Scores of the transfer experiment for every arm, seed, epoch and held-out site, in tables, JSON and a figure.
 
-Everything is made from the confusions that training wrote to metrics.jsonl, at a threshold of 0.5. Figures of several
-seeds are their mean and, after the sign, their standard deviation.
+Everything is computed from the confusions that training wrote to metrics.jsonl, at a threshold of 0.5. Numbers of
+several seeds are given as mean ± standard deviation.
 """
 
 import math
@@ -17,7 +17,7 @@ from travjax.evaluation.metrics import NAMES, OVERALL, PAPER_REAL, THRESHOLD, Co
 from travjax.evaluation.tables import rows_table, with_notes
 
 ALL = "all held-out"
-"""The held-out sites together: their confusions are added."""
+"""Name of the held-out sites together, whose confusions are added."""
 
 PAPER_BEST = {
     "random": None,
@@ -29,7 +29,7 @@ PAPER_BEST = {
 COUNTS = ("tn", "fp", "fn", "tp")
 
 Confusions = dict[str, dict[str, Confusion]]
-"""Confusions by site, ALL among them, and by event, "overall" among them."""
+"""Confusions by site, including ALL, and by event, including "overall"."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Epoch:
 
 
 def _is_scored(row: Mapping) -> bool:
-    """Tells whether a row holds counts of every event on each site, and a number from validation if any."""
+    """Tells whether a row holds counts of every event on each site, and a valid validation score if it has one."""
     at = lambda table, key: table.get(key) if isinstance(table, Mapping) else None
     sites, precision = row.get("eval_sets"), row.get("average_precision")
     if not isinstance(sites, Mapping) or type(row.get("epoch")) is not int:
@@ -82,17 +82,17 @@ class ArmRun:
     epochs: tuple[Epoch, ...]
 
     def best(self, site: str) -> Epoch:
-        """Returns the epoch of the largest pooled F1 on a held-out site: the paper's way, which looks at the test."""
+        """Returns the epoch with the largest pooled F1 on a held-out site: the paper's choice, which uses test data."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.held_out[site][OVERALL].f1))
 
     @property
     def chosen(self) -> Epoch:
-        """Returns the epoch of the best average precision on validation windows, whose checkpoint is the run's best."""
+        """The epoch with the best average precision on validation windows, whose checkpoint is the run's best."""
         return max(self.epochs[1:], key=lambda epoch: _or_zero(epoch.validation))
 
 
 def always_fails(counts: Confusion) -> Confusion:
-    """Returns the counts of the predictor that says "fails" of every trajectory, on the same samples."""
+    """Returns the counts, on the same samples, of the predictor that says "fails" for every trajectory."""
     return Confusion(0, counts.tn + counts.fp, 0, counts.fn + counts.tp)
 
 
@@ -102,7 +102,7 @@ def _or_zero(value: float | None) -> float:
 
 @dataclass(frozen=True)
 class Results:
-    """All runs: by arm, and of each arm by seed."""
+    """All runs by arm and seed."""
 
     arms: dict[str, dict[int, ArmRun]]
 
@@ -114,12 +114,12 @@ class Results:
 
     @cached_property
     def _some(self) -> Confusions:
-        """Returns those of any run: how many samples fail is the same in all."""
+        """The confusions of any one run: how many samples fail is the same in all."""
         return next(iter(next(iter(self.arms.values())).values())).epochs[0].held_out
 
     @property
     def sites(self) -> list[str]:
-        """Returns the held-out sites, and ALL if they are several."""
+        """The held-out sites, and ALL if there are several."""
         return list(self._some)
 
     @property
@@ -128,11 +128,11 @@ class Results:
         return list(next(iter(self._some.values())))
 
     def always(self, site: str, event: str = OVERALL) -> Confusion:
-        """Returns the counts of the predictor that says "fails" of every trajectory."""
+        """Returns the counts of the predictor that says "fails" for every trajectory."""
         return always_fails(self._some[site][event])
 
     def f1(self, arm: str, site: str) -> np.ndarray:
-        """Returns F1, the events pooled, of each seed and epoch: [seeds, epochs + 1]."""
+        """Returns pooled F1 of each seed and epoch: [seeds, epochs + 1]."""
         runs = self.arms[arm].values()
         return np.array([[epoch.held_out[site][OVERALL].f1 for epoch in run.epochs] for run in runs])
 
@@ -165,7 +165,7 @@ ARM_COLUMNS = {
 
 
 def arms_table(results: Results) -> str:
-    """Returns a table: for each site the predictor "always fails", each arm at its two epochs, and the paper's."""
+    """Returns a table with, for each site, the predictor "always fails", each arm at its two epochs, and the paper."""
     rows: list[dict] = []
     for site in results.sites:
         always = results.always(site)
@@ -200,7 +200,7 @@ EVENT_COLUMNS = {
 
 
 def events_table(results: Results, arm: str) -> str:
-    """Returns a table: for each site and event an arm untrained, at its best and at validation's epoch; the paper's."""
+    """Returns a table with, for each site and event, an arm untrained, at its two epochs, and in the paper."""
     rows = []
     for site in results.sites:
         states = {"untrained": results.first(arm), "best epoch": results.best(arm, site)}
@@ -236,7 +236,7 @@ def _numbers(epochs: Iterable[Epoch]) -> str:
 
 
 def mean_and_spread(values: Sequence[float]) -> str:
-    """Returns mean and standard deviation of the seeds; a dash where a value is undefined."""
+    """Formats mean and standard deviation over the seeds, or a dash where a value is undefined."""
     if any(math.isnan(value) for value in values):
         return "-"
     spread = f" ± {np.std(values, ddof=1):.3f}" if len(values) > 1 and np.ptp(values) > 0 else ""
@@ -244,7 +244,7 @@ def mean_and_spread(values: Sequence[float]) -> str:
 
 
 def _undefined(results: Results, rows: Iterable[Mapping]) -> list[str]:
-    """Says why figures of some events and sites in the rows of a table are a dash."""
+    """Explains why some events and sites have a dash in the rows of a table."""
     none = [
         f"{event} on {site}: no trajectory fails, so recall, precision and F1 are undefined"
         for site in results.sites
@@ -268,9 +268,9 @@ def results_json(results: Results) -> dict:
 
 
 def transfer_figure(results: Results, arms: Mapping[str, str], maps: str = "real maps") -> Figure:
-    """Draws F1 of every arm after each epoch on each held-out site: the mean of the seeds, and the band that they span.
+    """Draws F1 of every arm after each epoch on each held-out site: the mean of the seeds and their range.
 
-    arms: their colours; maps: what they are trained on
+    arms: colours by arm; maps: name of the maps that they are trained on
     Epoch 0 is the first state; the dashed line is the predictor that always says "fails".
     """
     figure = Figure(figsize=(4.6 * len(results.sites) + 0.6, 4.6), layout="constrained")
