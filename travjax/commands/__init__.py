@@ -1,6 +1,6 @@
-"""The commands of `travjax`, a module each: `add(commands)` adds its parser, `run(arguments)` does it.
+"""The commands of `travjax`, one module each: `add(commands)` adds its parser, `run(arguments)` runs it.
 
-A command parses its words, calls a function of the library and prints what it returns. Parsers of all commands are
-built for each of them, so a module imports what is slow to import (matplotlib, flax) where it is used. Options that
-several commands and experiments have are in travjax/options.py; cli.py lists the commands.
+A command parses its options, calls a function of the library and prints what it returns. Every start builds the parsers
+of all commands, so a module imports slow packages (matplotlib, flax) only where it uses them. Options that several
+commands and experiments share are in travjax/options.py; cli.py lists the commands.
 """

@@ -27,7 +27,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Measures labelling, or the network."""
+    """Measures terrain and labelling, or the network."""
     grid, robot, actions = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     if arguments.network:

@@ -16,13 +16,13 @@ from travjax.evaluation.dataset_tables import are_statistics, dataset_tables
 from travjax.files import find_preset, require_replaceable, resolved, save_text, user_path
 
 SYNTHETIC = ("maps", "seed", "validation", "test", "world")
-"""The options of a synthetic data set."""
+"""Names of the options of a synthetic data set."""
 
 REAL = ("test_strip", "validation_strip", "gap", "max_unknown", "no_rotations", *options.DEM_OPTIONS)
-"""The options of DEM files."""
+"""Names of the options of a data set from DEM files."""
 
 MAKING = (*SYNTHETIC, "sites", "dem", "held_out", *REAL, "robot", "actions", "size", "spacing", "out")
-"""The options of a data set that is made, not of one that is checked."""
+"""Names of the options for making a data set, which checking one does not take."""
 
 
 def add(commands: options.Commands) -> None:
@@ -90,9 +90,9 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Makes and saves a data set or checks one, prints what it holds, and exports it if that is asked for."""
+    """Makes and saves a data set or checks one, prints its contents, and exports it if asked to."""
     folder = arguments.check or arguments.out
-    statistics = folder.parent / f"{folder.name}_statistics.txt"  # the folder holds the data set alone
+    statistics = folder.parent / f"{folder.name}_statistics.txt"  # the folder holds only the data set
     if arguments.check:
         _require_left_out(arguments, MAKING, "--check is given")
     else:
@@ -115,7 +115,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
-    """Makes and saves the data set that is asked for."""
+    """Makes and saves the data set that the options describe."""
     files = bool(arguments.dem or arguments.held_out)
     if arguments.sites:
         _require_left_out(arguments, (*SYNTHETIC, "dem", "held_out", *REAL), "--sites is given")

@@ -29,7 +29,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Labels the maps."""
+    """Labels every trajectory of the maps and writes the results."""
     grid, robot, actions = options.setup(arguments)
     maps = options.maps(arguments, grid)
     label_maps(maps, robot, actions, grid, arguments.out, figures=not arguments.no_figures)

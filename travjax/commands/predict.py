@@ -42,7 +42,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Predicts failures on maps."""
+    """Predicts failures on the maps and writes the results."""
     from travjax.runs.prediction_report import predict_maps
     from travjax.runs.predictor import Predictor
 

@@ -18,7 +18,7 @@ def add(commands: options.Commands) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Makes maps of each style."""
+    """Makes maps of each style and writes them with pictures."""
     grid = Grid(arguments.size, arguments.spacing)
     count, seed = options.count(arguments), options.seed(arguments)
     write_terrain(arguments.style or list(STYLES), range(seed, seed + count), grid, arguments.out, arguments.world)

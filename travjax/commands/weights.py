@@ -76,12 +76,12 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _told(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Returns what the user knows of the weights."""
+    """Returns what the options say about the weights."""
     return {"input": arguments.input, "stride_in": arguments.stride_in, "prefix": arguments.prefix}
 
 
 def _fetched(arguments: argparse.Namespace) -> "Weights":
-    """Fetches weights of the hub, and names the repository in their origin."""
+    """Fetches weights from the Hugging Face hub, and names the repository in their origin."""
     from travjax.resnet.imagenet_weights import HUB, fetch, load_weights
 
     repository, filename = arguments.hub or HUB[0], arguments.file or HUB[1]
