@@ -1,8 +1,8 @@
 """Landforms of natural ground: fractal relief, rocks, craters, ledges and wheel ruts, each by rules of the literature.
 
-Every function draws from a generator of its own and works on the `Nodes` of a raster: some return what they add to the
-ground, [rows, cols] float64 metres, and rocks are laid on the ground that is there. Everything but the fractal relief
-is drawn in metres, so that the same landforms come out at any spacing of the nodes.
+Every function draws from its own generator and works on the `Nodes` of a raster. Most return what they add to the
+ground, [rows, cols] float64 metres; rocks are laid on the existing ground. Everything except the fractal relief is drawn
+in metres, so that the same landforms come out at any spacing of the nodes.
 """
 
 import math
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 
 LONGEST_WAVE = 16.0
-"""Metres: the fractal relief of a small raster is cut out of a period of this length at least."""
+"""Metres: smallest period of the fractal relief that a small raster is cut out of."""
 
 ROCK_SIDES = (0.6, 1.0)
 """Width over length of a rock's outline, drawn uniformly."""
@@ -31,7 +31,7 @@ CRATER_DEPTH, CRATER_RIM = 0.2, 0.04
 """Depth from rim to floor and height of the rim of a fresh crater, over its diameter (Pike 1977; Melosh 1989)."""
 
 CRATER_REACH = 3.0
-"""Crater radii at which its ejecta end."""
+"""Distance, in crater radii, at which the ejecta end."""
 
 BACKSLOPE = 4.0
 """Metres over which the ground behind a ledge falls off to 1/e of the ledge's height."""
@@ -50,8 +50,8 @@ BERM = 0.35
 class Nodes:
     """The nodes of a raster, the middle one at (0, 0).
 
-    rows, cols: their number to the north and to the east
-    spacing:    metres between neighbouring ones
+    rows, cols: numbers of nodes to the north and to the east
+    spacing:    metres between neighbouring nodes
     """
 
     rows: int
@@ -74,11 +74,11 @@ class Nodes:
         return (np.arange(self.rows) - self.rows // 2) * self.spacing
 
     def area(self, beyond: float) -> float:
-        """Returns the square metres of the raster with a margin of so many metres around it."""
+        """Returns the area in square metres of the raster with a margin of `beyond` metres around it."""
         return (np.ptp(self.x) + 2 * beyond) * (np.ptp(self.y) + 2 * beyond)
 
     def places(self, rng: np.random.Generator, count: int, beyond: float) -> np.ndarray:
-        """Returns uniform random points (x, y) on the raster and a margin of so many metres: [count, 2]."""
+        """Returns uniform random points (x, y) on the raster and a margin of `beyond` metres: [count, 2]."""
         low = np.array([self.x[0], self.y[0]]) - beyond
         high = np.array([self.x[-1], self.y[-1]]) + beyond
         return rng.uniform(low, high, (count, 2))
@@ -101,10 +101,10 @@ def _within(axis: np.ndarray, middle: float, reach: float, spacing: float) -> sl
 
 
 def fractal_relief(rng: np.random.Generator, nodes: Nodes, hurst: float, roughness: float) -> np.ndarray:
-    """Returns a fractional Brownian surface by spectral synthesis, cut out of one of twice the size: no period shows.
+    """Returns a fractional Brownian surface by spectral synthesis, cut out of one of twice the size to hide its period.
 
     hurst:     Hurst exponent H: the root-mean-square difference of heights at a distance r is proportional to r^H
-    roughness: metres, that difference at 1 m, expected
+    roughness: metres, the expected value of that difference at 1 m
     Source: Shepard et al. (2001), The roughness of natural terrain, J. Geophys. Res. 106(E12), 32777-32795.
     """
     rows, cols = (
@@ -115,7 +115,7 @@ def fractal_relief(rng: np.random.Generator, nodes: Nodes, hurst: float, roughne
     frequency = np.hypot(along_y, along_x)
     frequency[0, 0] = np.inf
     amplitude = frequency ** -(hurst + 1)
-    twice = np.full(len(along_x[0]), 2.0)  # frequencies that stand for their negatives as well
+    twice = np.full(len(along_x[0]), 2.0)  # these frequencies also stand for their negatives
     twice[0] = 1
     if cols % 2 == 0:
         twice[-1] = 1
@@ -131,15 +131,15 @@ def fractal_relief(rng: np.random.Generator, nodes: Nodes, hurst: float, roughne
 
 @dataclass(frozen=True)
 class Rocks:
-    """Rocks as they lie: [n] arrays.
+    """Rocks on the ground: [n] arrays.
 
     diameter:      metres; the outline has the area of a circle of that diameter
-    x, y:          metres, of the middle
+    x, y:          metres, position of the middle
     height:        metres above the ground at the middle
-    heading:       radians, anticlockwise from +y, of the longer axis
+    heading:       radians, direction of the longer axis, anticlockwise from +y
     sides:         width over length
-    exponent:      of the superellipse
-    burial:        as ROCK_BURIAL
+    exponent:      exponent of the superellipse
+    burial:        as in ROCK_BURIAL
     """
 
     diameter: np.ndarray
@@ -152,14 +152,14 @@ class Rocks:
     burial: np.ndarray
 
     def only(self, chosen: np.ndarray) -> "Rocks":
-        """Returns some of them."""
+        """Returns the chosen rocks."""
         return Rocks(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def rock_area(diameter, abundance: float):
     """Returns the share of the ground that rocks of at least a diameter [m] cover, F(D) = k exp(-q(k) D).
 
-    abundance: k, the share that all rocks cover; q(k) = 1.79 + 0.152 / k
+    abundance: k, the share that all rocks together cover; q(k) = 1.79 + 0.152 / k
     Source: Golombek and Rapp (1997), Size-frequency distributions of rocks on Mars and Earth analog sites,
     J. Geophys. Res. 102(E2), 4117-4129.
     """
@@ -176,7 +176,7 @@ def draw_rocks(
     """
     edges = np.geomspace(smallest, largest, 257)
     area = -np.diff(rock_area(edges, abundance)) if abundance else np.zeros(256)
-    count = area / (np.pi / 4 * edges[:-1] * edges[1:])  # rocks a square metre in each class of diameters
+    count = area / (np.pi / 4 * edges[:-1] * edges[1:])  # rocks per square metre in each class of diameters
     beyond = largest
     total = rng.poisson(count.sum() * nodes.area(beyond))
     rising = np.concatenate([[0], np.cumsum(count)])
@@ -195,7 +195,7 @@ def draw_rocks(
 
 
 def lay_rocks(ground: np.ndarray, nodes: Nodes, rocks: Rocks) -> np.ndarray:
-    """Returns the ground with rocks on it, each as high as it is above the ground at its middle."""
+    """Returns the ground with rocks on it; the height of a rock counts from the ground at its middle."""
     covered = ground.copy()
     length, width = _half_axes(rocks)
     for index in range(len(rocks.diameter)):
@@ -207,7 +207,7 @@ def lay_rocks(ground: np.ndarray, nodes: Nodes, rocks: Rocks) -> np.ndarray:
         east, north = nodes.x[None, cols] - x, nodes.y[rows, None] - y
         across = np.abs(east * cosine + north * sine) / width[index]
         along = np.abs(north * cosine - east * sine) / length[index]
-        radius = across**exponent + along**exponent  # to the power of the exponent
+        radius = across**exponent + along**exponent  # raised to the power of the exponent
         burial = rocks.burial[index]
         upper = np.maximum(1 - (1 - burial**exponent) * radius, 0) ** (1 / exponent)
         top = ground[nodes.nearest(x, y)] + rocks.height[index] * (upper - burial) / (1 - burial)
@@ -230,8 +230,8 @@ def _half_axes(rocks: Rocks) -> tuple[np.ndarray, np.ndarray]:
 def crater_profile(radii: np.ndarray, diameter: float, freshness: float) -> np.ndarray:
     """Returns the height of a crater [m] at distances from its middle, in units of its radius.
 
-    freshness: 1 for a new one, less for one that was levelled: depth and rim are lower, the rim is rounded
-    A new one is a parabolic bowl with a rim and ejecta that fall off with the third power (McGetchin et al. 1973, Earth
+    freshness: 1 for a new crater, less for a levelled one, which is shallower, with a lower and rounded rim
+    A new crater is a parabolic bowl with a rim, and ejecta that fall off with the third power (McGetchin et al. 1973, Earth
     Planet. Sci. Lett. 20, 226-236). Sources: Pike (1977), Impact and Explosion Cratering, 489-509; Melosh (1989),
     Impact Cratering.
     """
@@ -250,12 +250,12 @@ def craters(
     largest: float,
     freshness: tuple[float, float],
 ) -> np.ndarray:
-    """Returns what craters add to the ground, [rows, cols] metres; one levels the older ones that it hits.
+    """Returns what craters add to the ground, [rows, cols] metres; a crater levels the older ones that it hits.
 
-    density:           craters of at least 1 m a square metre; those of at least D are density D^-2, the slope of a
+    density:           craters of at least 1 m per square metre; density D^-2 have at least D metres, the slope of a
                        surface in equilibrium (Gault 1970, Radio Sci. 5, 273-291)
-    smallest, largest: metres, of their diameters
-    freshness:         lowest and highest, as `crater_profile` takes it; drawn uniformly
+    smallest, largest: metres, diameters
+    freshness:         lowest and highest freshness, as `crater_profile` takes it; drawn uniformly
     """
     beyond = CRATER_REACH * largest / 2
     total = rng.poisson(density * (smallest**-2 - largest**-2) * nodes.area(beyond))
@@ -278,9 +278,10 @@ def craters(
 def ledges(rng: np.random.Generator, nodes: Nodes, density: float, heights: tuple[float, float]) -> np.ndarray:
     """Returns what ledges of layered bedrock add to the ground: [rows, cols] metres.
 
-    density: ledges a metre across them, whose lines meander and are broken by gaps in which the ledge runs out
-    heights: metres, least and largest, drawn uniformly; a face is one cell wide, and the ground behind it falls off
-    gently, as on a dipping layer, so that all faces look the same way. Our choice of shape.
+    density: ledges per metre across them; their lines meander and have gaps where the ledge runs out
+    heights: metres, least and largest, drawn uniformly
+    A face is one cell wide, and the ground behind it falls off gently, as on a dipping layer, so that all faces point
+    the same way. The shape is our choice.
     """
     across, along = _directions(rng, nodes)
     for _ in range(9):
@@ -298,10 +299,11 @@ def ledges(rng: np.random.Generator, nodes: Nodes, density: float, heights: tupl
 def ruts(
     rng: np.random.Generator, nodes: Nodes, density: float, depths: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns what the tracks of a vehicle add to the ground, [rows, cols] metres, and where no rock is left.
+    """Returns what the tracks of a vehicle add to the ground, [rows, cols] metres, and where they leave no rock.
 
-    density: passes a metre across them, each a pair of ruts along a smooth curve
-    depths:  metres, least and largest, drawn uniformly; beside each rut lie berms. Our choice of shape.
+    density: passes per metre across them, each a pair of ruts along a smooth curve
+    depths:  metres, least and largest, drawn uniformly
+    Berms lie beside each rut. The shape is our choice.
     """
     added, driven = np.zeros(nodes.shape), np.zeros(nodes.shape, bool)
     for middle in _crossings(rng, nodes, density):
@@ -316,7 +318,7 @@ def ruts(
 
 
 def _directions(rng: np.random.Generator, nodes: Nodes) -> tuple[np.ndarray, np.ndarray]:
-    """Returns metres across and along lines of a random direction: two [rows, cols]."""
+    """Returns each node's position across and along lines of a random direction, in metres: two [rows, cols]."""
     angle = rng.uniform(0, np.pi)
     x, y = nodes.x[None, :], nodes.y[:, None]
     return x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
@@ -331,16 +333,16 @@ def _crossings(rng: np.random.Generator, nodes: Nodes, density: float) -> np.nda
 def _waves(
     rng: np.random.Generator, where: np.ndarray, count: int, shortest: float, longest: float, steepness: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the sum of random waves [m] and its slope at places along a line [m], in the shape of these.
+    """Returns the sum of random waves [m] and its slope at places along a line [m], in the shape of `where`.
 
-    shortest, longest: metres, of the wavelengths
+    shortest, longest: metres, range of the wavelengths
     steepness:         root-mean-square slope
     """
     knots = np.arange(where.min(), where.max() + KNOTS, KNOTS)
     height, slope = np.zeros(len(knots)), np.zeros(len(knots))
     for wavelength in np.exp(rng.uniform(math.log(shortest), math.log(longest), count)):
         phase = 2 * np.pi / wavelength * knots + rng.uniform(0, 2 * np.pi)
-        amplitude = steepness * math.sqrt(2 / count)  # of the slope
+        amplitude = steepness * math.sqrt(2 / count)  # amplitude of the slope
         height += amplitude * wavelength / (2 * np.pi) * np.sin(phase)
         slope += amplitude * np.cos(phase)
     return np.interp(where, knots, height), np.interp(where, knots, slope)

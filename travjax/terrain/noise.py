@@ -2,8 +2,8 @@
 
 The plane is skewed so that a triangular lattice becomes a square one. Every lattice vertex within sqrt(2) of a point
 adds (2 - d^2)^4 (g . d), with d the vector from the vertex and g one of eight gradients that a permutation of 256
-picks. A point lies in one lattice cell, and five vertices at most can reach it: the cell's corners and one outside. The
-gradients of all eight vertices around a cell are packed in one integer, so that a point reads memory once.
+picks. A point lies in one lattice cell, and at most five vertices can reach it: the cell's corners and one outside. The
+gradients of all eight vertices around a cell are packed into one integer, so that each point reads memory once.
 """
 
 from functools import lru_cache
@@ -21,14 +21,14 @@ from travjax.simulation.arrays import integers, numbers
 SKEW = (1 / 3**0.5 - 1) / 2
 UNSKEW = (3**0.5 - 1) / 2
 NORM = 47
-"""Scales the sum to [-1, 1]."""
+"""Divisor that scales the sum to [-1, 1]."""
 
 SEEDS = 10_000
 """Noise seeds of terrain lie in [0, SEEDS)."""
 
 AROUND = ((0, 0), (1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (-1, 1), (0, 2))
-"""Vertices that can reach a point of cell (0, 0), three bits each in a cell's code. Of the last four, one counts: below
-the diagonal x + y = 1 of the cell those at 4 and 6, above it those at 5 and 7, the first of each pair where x > y."""
+"""Vertices that can reach a point of cell (0, 0), three bits each in a cell's code. Only one of the last four
+counts: below the cell's diagonal x + y = 1 the vertex at 4 (if x > y) or 6, above it the one at 5 (if x > y) or 7."""
 
 
 def permutations(seeds) -> np.ndarray:
@@ -50,8 +50,8 @@ def permutations(seeds) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def permutation_table() -> jax.Array:
-    """Permutations of all terrain seeds, on the device: [SEEDS, 256] uint8."""
-    with jax.ensure_compile_time_eval():  # an array, and no tracer, when the caller is being traced
+    """Returns the permutations of all terrain seeds, on the device: [SEEDS, 256] uint8."""
+    with jax.ensure_compile_time_eval():  # an array, not a tracer, even while the caller is traced
         return jnp.asarray(permutations(np.arange(SEEDS)))
 
 
@@ -78,7 +78,7 @@ def _noise_of_permutations(tables, x, y):
 def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, " cols"], y: Float[Array, " rows"], reach: float):
     """Returns noise on the grid of the axes x and y, all within [-reach, reach]: [rows, cols].
 
-    Codes of the lattice cells are computed first where they are fewer than the points.
+    Codes of the lattice cells are computed first where there are fewer cells than points.
     """
     half = int(np.ceil(reach)) + 1
     edge = 2 * half + 1
@@ -91,7 +91,7 @@ def noise_on_axes(permutation: Int[Array, "256"], x: Float[Array, " cols"], y: F
 
 
 def cell_codes(permutation: Int[Array, "256"], i: Int[Array, "*s"], j: Int[Array, "*s"]) -> Int[Array, "*s"]:
-    """Gradients of the vertices AROUND lattice cells (i, j), packed into one integer each."""
+    """Packs the gradients of the vertices AROUND lattice cells (i, j) into one integer for each cell."""
     hashed = permutation.astype(jnp.int32)
     code = jnp.zeros(jnp.broadcast_shapes(i.shape, j.shape), jnp.int32)
     for bits, (right, up) in enumerate(AROUND):
@@ -103,7 +103,7 @@ def cell_codes(permutation: Int[Array, "256"], i: Int[Array, "*s"], j: Int[Array
 
 def noise_at(x, y, code_of_cell) -> Float[Array, "*s"]:
     """Returns noise at points, given a function from cell indices (i, j) to the cells' codes."""
-    skew = rounded((x + y) * SKEW)  # else a point beside a cell's edge would lie in one cell here, in another there
+    skew = rounded((x + y) * SKEW)  # else a point at a cell's edge might fall into different cells in different loops
     i, j = jnp.floor(x + skew), jnp.floor(y + skew)
     inside_x, inside_y = x + skew - i, y + skew - j
     code = code_of_cell(i.astype(jnp.int32), j.astype(jnp.int32))

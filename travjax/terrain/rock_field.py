@@ -1,8 +1,8 @@
-"""Rock fields: natural ground made by another process than the paper's noise, and two sites of it.
+"""Rock fields: natural ground made by a process other than the paper's noise, and two sites made with it.
 
-Fractal relief, ledges, craters, wheel ruts, and rocks on top (landforms.py, with the sources). A seed gives parameters
-within RANGES, and parameters and a seed give the ground; each landform draws from random numbers of its own, so that
-one of them changes without the others. SITES are two sites of different character that stand in for real maps.
+A rock field has fractal relief, ledges, craters, wheel ruts, and rocks on top (landforms.py, with the sources). A seed
+gives parameters within RANGES; parameters and seed give the ground. Each landform has its own random numbers, so that
+changing one leaves the others as they are. SITES are two sites of different character that stand in for real maps.
 """
 
 import math
@@ -18,10 +18,10 @@ from travjax.simulation.grid import Grid
 from travjax.terrain.landforms import Nodes, craters, draw_rocks, fractal_relief, lay_rocks, ledges, ruts
 
 STYLE = "rock_field"
-"""What its maps are called beside the five styles of the paper."""
+"""Name of these maps as a style, beside the five styles of the paper."""
 
 FINEST, MOST_NODES = 0.03, 4097**2
-"""Metres between nodes, at least, and nodes of a raster, at most."""
+"""Smallest spacing of nodes in metres, and largest number of nodes in a raster."""
 
 _SEED = f"an integer from 0 to {2**32 - 1}"
 
@@ -35,12 +35,12 @@ class RockFieldParams:
     rock_abundance:     share of the ground that rocks cover, k of Golombek and Rapp (1997)
     smallest_rock, largest_rock: diameters
     rock_height:        mean height over diameter
-    crater_density:     craters of at least 1 m a square metre
+    crater_density:     craters of at least 1 m per square metre
     smallest_crater, largest_crater: diameters
-    crater_freshness:   of the most levelled one; the freshest is 1
-    ledge_density:      ledges a metre across them
+    crater_freshness:   freshness of the most levelled crater; that of the freshest is 1
+    ledge_density:      ledges per metre across them
     lowest_ledge, highest_ledge: heights of their faces
-    rut_density:        passes of a vehicle a metre across them
+    rut_density:        passes of a vehicle per metre across them
     shallowest_rut, deepest_rut: depths
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
@@ -101,7 +101,7 @@ sites of Opportunity and of Pathfinder's surroundings (Golombek et al. 2003).
 
 @dataclass(frozen=True)
 class RockSite:
-    """A site that can be made again: parameters, seed, and metres to the east and to the north."""
+    """A reproducible site: parameters, seed, and metres to the east and to the north."""
 
     params: RockFieldParams
     seed: int
@@ -169,7 +169,7 @@ def rock_field(params: RockFieldParams, seed: int, shape: tuple[int, int], spaci
 
 
 def rock_fields(seeds: Sequence[int], grid: Grid) -> np.ndarray:
-    """Returns a rock field for each seed, with the parameters of it: [n, rows, cols] float32 metres."""
+    """Returns a rock field for each seed, with parameters drawn from that seed: [n, rows, cols] float32 metres."""
     maps = [rock_field(sample_rock_field(seed), seed, grid.shape, grid.spacing) for seed in seeds]
     return np.array(maps, np.float32)
 
@@ -192,7 +192,7 @@ def _nodes(shape: Any, spacing: Any) -> Nodes:
 
 
 def _generators(seed: int) -> list[np.random.Generator]:
-    """Returns generators for the parameters and for each landform; none depends on how the others are used."""
+    """Returns generators for the parameters and for each landform; each is independent of how the others are used."""
     number = integers("seed", seed, _SEED, 0, 2**32 - 1)
     require(number.ndim == 0, "seed", seed, _SEED)
     return [np.random.Generator(np.random.PCG64(one)) for one in np.random.SeedSequence(int(number)).spawn(6)]

@@ -47,7 +47,7 @@ class TerrainParams:
 
     perc_obstacles, smooth_transition: where the mixing noise (0 to 1) turns from mountains to plains, and how softly
     distribution_x, distribution_y:    0 to 1, how often plains and mountains alternate along x and y
-    height_obstacles:                  metres, height of the mountains (negative: craters)
+    height_obstacles:                  metres, height of the mountains (negative for craters)
     smooth_mountains, smooth_plains:   0 to 1, feature size from 1/M to M metres, M the map size or the `world`; the
                                        style mountain_crater draws smooth_mountains up to 6
     slopes_variation:                  exponent of the plains
@@ -129,7 +129,9 @@ RANGES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "scattered_sharp": (_SHARP, _SHARP),
 }
-"""For each style the two halves of its maps: a number, or the ends of a uniform distribution (SPEC section 2)."""
+"""Parameters for the two halves of each style's maps: a number, or the ends of a uniform distribution (SPEC section
+2).
+"""
 
 STYLES = tuple(RANGES)
 
@@ -137,20 +139,20 @@ _LIMITS = np.array(
     [[[np.broadcast_to(half[field], 2) for field in FIELDS] for half in halves] for halves in RANGES.values()],
     np.float32,
 )
-"""[style, half, field, (low, high)]."""
+"""RANGES as an array: [style, half, field, (low, high)]."""
 
 
 @usual_flags()
 def generate_terrain(
     style: str | Sequence[str], seeds, *, grid: Grid = Grid(), world: float | None = None
 ) -> Float[Array, "n rows cols"]:
-    """Makes maps of a style, one for each seed; the same (style, seed) is the same map in any batch.
+    """Makes maps of a style, one for each seed; the same (style, seed) gives the same map in any batch.
 
     style: one of STYLES, or a sequence with one for each seed; or rock_field.STYLE for all of them
     seeds: integers in [0, 2^32): a sequence, a range or one number
     world: as `elevation` takes it; none for rock fields
-    Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1, or those of landforms.py.
-    Raises InputError for an unknown style, no or bad seeds, another number of styles than of seeds, or a bad world.
+    Returns heights [n, rows, cols] in metres. Source: the paper's Algorithm 1, or the sources of landforms.py.
+    Raises InputError for an unknown style, no or bad seeds, different numbers of styles and seeds, or a bad world.
     """
     if are_rock_fields([style] if isinstance(style, str) else list(style), world):
         _, numbered = _styles_and_seeds(style, seeds, (ROCK_FIELD,))
@@ -217,7 +219,7 @@ def require_world(world: float | None) -> None:
 
 
 def world_note(world: float | None, grid: Grid) -> str | None:
-    """Returns a line on the map size that features of the grid's maps are derived from, where that is not plain.
+    """Returns a line on the map size that sets the size of features, where it is not obvious, or None.
 
     Raises InputError for a bad world.
     """
@@ -236,9 +238,10 @@ def elevation(
 ) -> Float[Array, "*n rows cols"]:
     """Evaluates Algorithm 1 for given parameters: [rows, cols] for numbers, [n, rows, cols] for [n] arrays; metres.
 
-    noise_seed: an integer in [0, 10000), or [n] of them; these and the parameters are looked at, so not under `jit`
+    noise_seed: an integer in [0, 10000), or [n] of them; their values and those of the parameters are
+                checked, so this cannot run under `jit`
     world:      metres, the map size M from which features are derived; the grid's own unless given. Maps of one world
-                and different size are the same where they overlap
+                and different sizes agree where they overlap
     Raises InputError when the noise seed, a parameter that shapes the noise, or the world lies outside what is allowed.
     """
     require_grid(grid)
