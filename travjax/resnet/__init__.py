@@ -1,5 +1,5 @@
-"""The ResNet and its ImageNet weights, whoever made them.
+"""The ResNet, and ImageNet weights for it from several sources.
 
-In: images; files of weights of torch, Keras and others. Out: features; checked weights in one convention.
-Stands on Flax; on h5py and torch where files want them.
+In: images; weight files of torch, Keras and others. Out: features; checked weights in one convention.
+Stands on Flax; also on h5py and torch, for files that need them.
 """

@@ -2,8 +2,8 @@
 
 XLA's own gradients take most of a training step on a CPU: it inverts a maximum one element at a time, fuses the sums of
 batch normalisation into loops that run on one core, and transposes the operands of a kernel's gradient element by
-element. Written as below the same step takes a third of the time (BUILD_NOTES.md). On other backends the plain
-definitions are used. Images are NHWC, kernels HWIO.
+element. Written as below, the same step takes a third of the time (BUILD_NOTES.md). Other backends use the
+plain definitions. Images are NHWC, kernels HWIO.
 """
 
 from functools import partial
@@ -39,8 +39,8 @@ def batch_norm(
     """Normalises each channel by its mean and variance over the batch, in float32.
 
     scale, bias: [channels]
-    Returns the images as they came in shape and dtype, the mean and the (population) variance [channels], which are
-    taken as constants in differentiation.
+    Returns the normalised images in the same shape and dtype, and the mean and (population) variance [channels], which
+    differentiation treats as constants.
     """
     flat = images.reshape(-1, images.shape[-1]).astype(jnp.float32)
     normalised, mean, var = (_batch_norm if jax.default_backend() == "cpu" else _normalised)(flat, scale, bias, epsilon)
@@ -61,7 +61,7 @@ def _flat(images):
 
 @jax.custom_vjp
 def _pointwise(images, kernel):
-    """Computes a 1 x 1 convolution as one matrix product, and so its gradients."""
+    """Computes a 1 x 1 convolution as one matrix product, so that its gradients are matrix products as well."""
     return _pointwise_forward(images, kernel)[0]
 
 
@@ -83,7 +83,7 @@ _pointwise.defvjp(_pointwise_forward, _pointwise_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _same_resolution(images, kernel, padding: int):
-    """Computes a convolution of stride 1; the gradient of its images is one as well, with the kernel rotated."""
+    """Computes a convolution of stride 1; the images' gradient is also one, with the kernel rotated."""
     return _correlate(images, kernel, 1, padding)
 
 
@@ -104,7 +104,7 @@ _same_resolution.defvjp(_same_resolution_forward, _same_resolution_backward)
 
 @partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def _strided(images, kernel, stride: int, padding: int):
-    """Computes any other convolution; the gradient of its kernel is one matrix product over the patches under it."""
+    """Computes any other convolution; the kernel's gradient is one matrix product over the patches under it."""
     return _correlate(images, kernel, stride, padding)
 
 
@@ -161,7 +161,7 @@ def _max_pool_backward(saved, gradient):
     total = jnp.zeros((len(gradient), rows, cols, gradient.shape[-1]), gradient.dtype)
     for below in (0, 1):
         for right in (0, 1):
-            # Pixel i lies in window (i + 1) // 2 as well as in i // 2, its row there is i + 1 - 2 * window.
+            # Pixel i lies in windows (i + 1) // 2 and i // 2; its row within a window is i + 1 - 2 * window.
             window_row, window_col = (row + below) // 2, (col + right) // 2
             own = (row + 1 - 2 * window_row) * 3 + col + 1 - 2 * window_col
             twice = (below == 1) & (row % 2 == 0) | (right == 1) & (col % 2 == 0)
@@ -209,7 +209,7 @@ def _batch_norm_backward(epsilon: float, saved, gradients):
 
 
 def _total(pixels):
-    """Sums over the pixels [n, channels]; the operand is made first, since a fused sum runs on one core."""
+    """Sums over the pixels [n, channels]; the operand is computed first, because a fused sum runs on one core."""
     return lax.optimization_barrier(pixels).sum(axis=0)
 
 

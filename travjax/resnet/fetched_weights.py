@@ -1,8 +1,8 @@
 """ImageNet weights that are fetched once, converted and kept in the user's cache.
 
-They are those of `keras.applications.ResNet50`, which Keras made from the first ones of the ResNet's authors (MIT
+They are the weights of `keras.applications.ResNet50`, which Keras converted from those of the ResNet's authors (MIT
 licence): a v1 network with its strides in the 1x1 convolutions, like the trunk of every preset and the paper's network.
-The ResNet50s that timm, Microsoft and others keep on the Hugging Face hub are v1.5 and would be another network.
+The ResNet50s of timm, Microsoft and others on the Hugging Face hub are v1.5, which is a different network.
 """
 
 import hashlib
@@ -23,21 +23,21 @@ URL = (
 )
 SIZE = 94_765_736
 MD5 = "4d473c1dd8becc155b73f8504c6f6626"
-"""Bytes and checksum of the file, the latter as keras/src/applications/resnet.py gives it."""
+"""Size in bytes and checksum of the file, the latter from keras/src/applications/resnet.py."""
 
 KEPT = "weights/resnet50_keras.safetensors"
-"""The converted file in the cache."""
+"""Path of the converted file within the cache."""
 
 TIMEOUT = 30
-"""Seconds without an answer after which a server is given up."""
+"""Seconds without an answer after which the download is given up."""
 
 PIECE = 1 << 18
 
 
 def fetched_weights() -> Path:
-    """Returns the file in the cache, which is fetched, checked and converted if it is not there yet.
+    """Returns the file in the cache, and first fetches, checks and converts it if it does not exist yet.
 
-    Raises InputError when it cannot be fetched or written, is not the file that it should be, or h5py is missing.
+    Raises InputError when it cannot be fetched or written, is not the expected file, or h5py is missing.
     """
     cache = cache_folder()
     if cache is None:
@@ -60,7 +60,7 @@ def fetched_weights() -> Path:
 
 
 def _download(path: Path) -> None:
-    """Writes the file that lies at URL, with a progress bar; raises InputError when it is not the expected one."""
+    """Downloads the file at URL, with a progress bar; raises InputError when it is not the expected one."""
     digest, size = hashlib.md5(usedforsecurity=False), 0
     with path.open("wb") as file, progress.bar("ImageNet weights", SIZE, "B", unit_scale=True) as bar:
         for piece in _pieces():

@@ -1,13 +1,13 @@
 """ImageNet weights for the trunk: read from several kinds of files, checked name by name and shape by shape, and set.
 
-Whatever file they come from (weight_files.py), arrays are float32 afterwards and have one set of names: for each
+Whatever file they come from (weight_files.py), arrays become float32 with one set of canonical names: for each
 convolution `res2a_branch2a/kernel`, `/gamma`, `/beta`, `/mean`, `/var`; for the top layer, if there is one of 1000
 classes, `fc1000/kernel` and `fc1000/bias`. Kernels are [rows, cols, in, out] and take channels in the order R, G, B
 with values (x / 255 - mean) / std, about -2 to 2, a range that the input channels share (SPEC section 8).
 
-The weights of Keras are made for B, G, R with values x - mean (its `preprocess_input` in mode "caffe"), hundreds of
+The weights of Keras expect B, G, R with values x - mean (its `preprocess_input` in mode "caffe"), hundreds of
 units wide. Their first kernel is reversed and multiplied by PIXEL_SCALE, so that it does to (x / 255 - mean) / std
-what it did to their own values. Other files, of whatever names, may be made for that as well: preprocessing.py.
+what it did to their own values. Files with other names may also expect such values: see preprocessing.py.
 """
 
 from dataclasses import dataclass, replace
@@ -38,26 +38,26 @@ from travjax.resnet.stored_arrays import Stored, WeightFile, shown
 from travjax.resnet.weight_files import open_arrays, write_safetensors
 
 HUB = ("timm/resnet50.tv_in1k", "model.safetensors")
-"""Repository and file on the Hugging Face hub: the weights of torchvision."""
+"""Repository and file of torchvision's weights on the Hugging Face hub."""
 
 SHOWN = 6
-"""Mismatches that an error names; the others are counted."""
+"""Number of mismatches that an error names; the others are counted."""
 
 _CANONICAL = {"kernel": "kernel", "scale": "gamma", "bias": "beta", "mean": "mean", "var": "var"}
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights of a ResNet as load_weights read them.
+    """Weights of a ResNet, as load_weights returns them.
 
-    arrays:    float32, by canonical name
+    arrays:    float32 arrays by canonical name
     path:      the file
-    naming:    whose names the file uses
-    origin:    file and naming of which a file of save_safetensors was made, else of this file
-    stride_in: where the network that they were made for has its strides: "1x1" (v1) or "3x3" (v1.5)
+    naming:    the program whose names the file uses
+    origin:    file and naming that a file of save_safetensors was made from, else those of this file
+    stride_in: convolution with the strides in the network they were made for: "1x1" (v1) or "3x3" (v1.5)
     epsilon:   that network's batch-norm epsilon
-    input:     what pixels that network took, one of preprocessing.INPUTS; the arrays here take those of "torch"
-    left_out:  arrays of the file that are none of the network's, such as a top layer of other classes, with shapes
+    input:     pixel values that network expects, one of preprocessing.INPUTS; the arrays here expect those of "torch"
+    left_out:  arrays of the file that do not belong to the network, such as a top layer of other classes, with shapes
     """
 
     arrays: dict[str, np.ndarray]
@@ -87,12 +87,12 @@ def load_weights(
 ) -> Weights:
     """Reads and checks the weights of a network of this size, with or without its top layer.
 
-    input, stride_in: what names do not say: one of preprocessing.INPUTS, "1x1" or "3x3"; as the names are usual unless
-        given, and then checked as far as the numbers tell
-    prefix: what names begin with, where a file holds several networks
-    Raises InputError when the file is missing, damaged or of no known kind, needs pickled code to be run, its weights
-    show that they are made for another input, or its arrays do not fit: missing, unexpected, of a wrong shape, no
-    floating-point numbers, not finite, a negative variance. All of those are in one error.
+    input, stride_in: what names do not tell: one of preprocessing.INPUTS, and "1x1" or "3x3". By default the usual ones
+        for the file's names. The input is checked as far as the numbers allow
+    prefix: start of the names, where a file holds several networks
+    Raises InputError when the file is missing, damaged or of no known kind, when it needs pickled code to be run, when
+    its weights were evidently made for another input, and when arrays do not fit: missing, unexpected, of a wrong
+    shape, not floating-point, not finite, or with a negative variance. One error lists all that do not fit.
     """
     path = user_path(path)
     try:
@@ -102,7 +102,7 @@ def load_weights(
             arrays = _read(file.arrays, network, config)
             left_out = tuple(f"{shown(name)} {list(file.arrays[name].shape)}" for name in network.left_out)
         settings = _settings(file, network, input, stride_in, path)
-        replace(config, stride_in=settings["stride_in"], epsilon=settings["epsilon"])  # raises unless they are allowed
+        replace(config, stride_in=settings["stride_in"], epsilon=settings["epsilon"])  # raises unless both are allowed
         arrays = _canonical(arrays, network, settings["input"], told=input is not None, ours=bool(file.notes))
         return Weights(arrays, str(path), network.naming.title, left_out=left_out, **settings)
     except InputError as error:
@@ -110,9 +110,7 @@ def load_weights(
 
 
 def _settings(file: WeightFile, network: Recognised, input: str | None, stride_in: str | None, path: Path) -> dict:
-    """Returns origin, strides, epsilon and input: what the file says, or what is given, or what is usual under its
-    names.
-    """
+    """Returns origin, strides, epsilon and input: from the file, else as given, else the usual ones for its names."""
     naming, notes = network.naming, file.notes
     if notes:
         require(input in (None, "torch"), "input", input, "left out: the file is one of travjax weights, for torch")
@@ -130,7 +128,7 @@ def _settings(file: WeightFile, network: Recognised, input: str | None, stride_i
 
 
 def _variables(resnet: ResNet) -> dict[str, nnx.Variable]:
-    """Parameters and statistics by canonical name."""
+    """Returns parameters and statistics by canonical name."""
     named = {}
     for path, node in nnx.iter_graph(resnet):
         if isinstance(node, nnx.Variable):
@@ -150,7 +148,7 @@ def _shapes(config: ResNetConfig) -> dict[str, tuple[int, ...]]:
 def _read(found: dict[str, Stored], network: Recognised, config: ResNetConfig) -> dict[str, np.ndarray]:
     """Reads the network's arrays, float32, by canonical name; raises InputError that names whatever does not fit.
 
-    Only what has the right shape is read, so nothing takes more memory than the network.
+    Only arrays of the right shape are read, so reading takes no more memory than the network.
     """
     wrong = [f"{shown(name)} is missing" for name in network.expected if name not in found]
     wrong += [f"{shown(name)} is unexpected" for name in network.unexpected]
@@ -185,11 +183,10 @@ def _float32(array: np.ndarray) -> np.ndarray:
 def _canonical(
     arrays: dict[str, np.ndarray], network: Recognised, input: str, told: bool, ours: bool
 ) -> dict[str, np.ndarray]:
-    """Arrays in the canonical layout, for the canonical input; a convolution's bias is taken off the mean that is
-    subtracted from its output.
+    """Converts arrays to the canonical layout and input; a convolution's bias is subtracted from the running mean.
 
-    told: the input is the user's word, who may have weights without statistics
-    ours: the file is one of `travjax weights`, whose input was looked for when it was made
+    told: whether the user gave the input; the weights may then lack statistics
+    ours: whether `travjax weights` wrote the file, in which case the input was checked then
     """
     names = {canonical: shown(name) for name, (canonical, _) in network.expected.items()}
     require_kernel(arrays, names)
@@ -209,9 +206,9 @@ def _canonical(
 
 
 def apply_weights(resnet: ResNet, weights: Weights) -> None:
-    """Sets the trunk's parameters and statistics, also those of a network of `nnx.eval_shape`, which has none yet.
+    """Sets the trunk's parameters and statistics, even in a network of `nnx.eval_shape`, which has no arrays yet.
 
-    Where the epsilons differ gamma makes up for it, so that the function stays the same.
+    Where the epsilons differ, gamma is scaled to compensate, so that the function stays the same.
     Raises InputError when the sizes differ, or the strides are in other convolutions.
     """
     allowed = f'"{weights.stride_in}", as in the network of these weights ({weights.origin})'
@@ -230,13 +227,13 @@ def apply_weights(resnet: ResNet, weights: Weights) -> None:
 
 
 def save_safetensors(weights: Weights, path: str | Path) -> None:
-    """Writes canonical names and arrays to a file that load_weights reads back, whole or not at all."""
+    """Writes canonical arrays to a file that load_weights reads; the file is written whole or not at all."""
     notes = {key: getattr(weights, key) for key in ("origin", "stride_in", "epsilon")}
     write_safetensors(user_path(path), weights.arrays, notes)
 
 
 def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:
-    """Fetches a file of the Hugging Face hub, from its cache if it was fetched before.
+    """Fetches a file from the Hugging Face hub, or from the cache if it was fetched before.
 
     Raises InputError when it cannot be fetched.
     """
@@ -244,16 +241,16 @@ def fetch(repository: str = HUB[0], filename: str = HUB[1]) -> Path:
         import huggingface_hub
     except ImportError:
         raise InputError("fetching weights needs huggingface_hub: pip install huggingface_hub") from None
-    huggingface_hub.utils.logging.set_verbosity_error()  # it says each time that it tries again
+    huggingface_hub.utils.logging.set_verbosity_error()  # it would print a line for every retry
     try:
         return Path(huggingface_hub.hf_hub_download(repository, filename))
-    except Exception as error:  # of whichever HTTP client it uses
+    except Exception as error:  # which one depends on its HTTP client
         reason = (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
         raise InputError(f"{repository}/{filename}: cannot be fetched; allowed offline: a file: {reason}") from None
 
 
 def describe(weights: Weights) -> str:
-    """Makes a table of what was found."""
+    """Returns a table that describes the weights."""
     kernels = [array for name, array in weights.arrays.items() if name.endswith("/kernel")]
     zero = sum(int((kernel == 0).sum()) for kernel in kernels) / sum(kernel.size for kernel in kernels)
     rows = {
@@ -275,14 +272,14 @@ def describe(weights: Weights) -> str:
 
 
 def _statistics(arrays: dict[str, np.ndarray]) -> str:
-    """Says what the running means and variances are."""
+    """Says whether running means and variances were measured, and why not."""
     if has_statistics(arrays):
         return "measured"
     return "0 and 1: " + ("a network before training" if is_untrained(arrays) else "none, gamma and beta hold them")
 
 
 def _left_out(weights: Weights) -> str:
-    """Names the first arrays that are not the network's; most are not read at all."""
+    """Names the first arrays that do not belong to the network."""
     names = weights.left_out
     more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
     return f"{', '.join(names[:SHOWN])}{more}; only the trunk is needed" if names else "nothing"

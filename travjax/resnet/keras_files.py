@@ -1,7 +1,7 @@
-"""Arrays of Keras' files, by layer: .h5 of Keras 1 and 2, .weights.h5 and .keras of Keras 3.
+"""Reads the arrays of Keras files by layer: .h5 of Keras 1 and 2, .weights.h5 and .keras of Keras 3.
 
-Only arrays and names are taken, no layer is built and nothing of a model's configuration is run. An HDF5 file may
-point to others, by links, external storage or virtual data sets: none is opened.
+Only arrays and names are read; no layer is built, and no part of a model's configuration is run. An HDF5 file may point
+to other files, by links, external storage or virtual data sets; these are never opened.
 """
 
 import io
@@ -17,19 +17,19 @@ from travjax.config import InputError
 from travjax.resnet.stored_arrays import Stored, WeightFile, as_named, open_zip, reading, shown, type_name, unfolded
 
 KERAS_1 = {"W": "kernel", "b": "bias", "running_mean": "moving_mean", "running_std": "moving_variance"}
-"""Names of Keras 1 and those of Keras 2; both of the last hold variances."""
+"""Names of Keras 1 and the names of Keras 2 for them; both of the last two hold variances."""
 
 NORM = ("gamma", "beta", "moving_mean", "moving_variance")
 """Arrays of a batch normalisation, in the order in which Keras 3 numbers them."""
 
 NOT_LAYERS = ("optimizer", "optimizer_weights")
-"""Groups that hold the state of training."""
+"""Groups that hold the training state, not layers."""
 
 ARRAYS, CONFIG = "model.weights.h5", "config.json"
 """Parts of a .keras file."""
 
 LARGEST_CHUNK = 1 << 26
-"""Bytes of a chunk, which HDF5 unfolds at once; Keras writes none."""
+"""Largest chunk in bytes, since HDF5 decompresses a chunk at once; Keras writes no chunks."""
 
 
 def open_keras(path: Path, held: ExitStack) -> WeightFile:
@@ -48,7 +48,7 @@ def open_hdf5(path: Path, held: ExitStack) -> WeightFile:
 
 
 def _opened(source: Path | io.BytesIO, kind: str, layer_names: dict[str, str], held: ExitStack) -> WeightFile:
-    """Opens an HDF5 file; layer_names: the layers of groups that HDF5 does not name"""
+    """Opens an HDF5 file; layer_names: layers of groups whose names are only numbered"""
     try:
         import h5py
     except ImportError:
@@ -76,9 +76,11 @@ def _opened(source: Path | io.BytesIO, kind: str, layer_names: dict[str, str], h
 
 
 def _stored(item, name: str, kind: str) -> Stored:
-    """Returns a data set, once it is known to lie in the file."""
+    """Returns a data set, after checking that its data lie in this file."""
     with reading(kind):
-        elsewhere = item.is_virtual or item.external is not None  # before its shape, for which HDF5 looks elsewhere
+        elsewhere = (
+            item.is_virtual or item.external is not None
+        )  # checked first, since HDF5 opens other files for the shape
     if elsewhere:
         raise InputError(f"{shown(name)} lies in other files: must be in this one, others are not opened")
     with reading(kind):
@@ -111,7 +113,7 @@ def _name(place: list[str], layer: str | None) -> str:
 
 
 def _layer_names(config: bytes) -> dict[str, str]:
-    """Returns the layers' names by group, as Keras 3 numbers them; its first versions wrote no names beside arrays."""
+    """Returns layer names by group, as Keras 3 numbers them; its first versions stored no names with the arrays."""
     with reading(".keras"):
         model = json.loads(config)
     names: dict[str, str] = {}

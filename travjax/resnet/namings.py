@@ -1,6 +1,6 @@
-"""Whose names a file of ResNet weights uses, and which of its arrays are the network's.
+"""Recognises whose names a file of ResNet weights uses, and which of its arrays belong to the network.
 
-The canonical names are those of imagenet_weights.py. Any other program's may follow a prefix, as in
+The canonical names are those of imagenet_weights.py. Names of any other program may have a prefix, as in
 `state_dict.module.conv1.weight`.
 """
 
@@ -14,7 +14,7 @@ from travjax.resnet.stored_arrays import Stored, shown
 CLASSES = 1000
 
 TRAINING = ("optimizer", "optimizer_weights", "opt_state")
-"""Where a checkpoint keeps the state of training."""
+"""Keys under which a checkpoint keeps the training state."""
 
 _TORCHVISION = {"gamma": "weight", "beta": "bias", "mean": "running_mean", "var": "running_var"}
 _KERAS = {"gamma": "gamma", "beta": "beta", "mean": "moving_mean", "var": "moving_variance"}
@@ -22,11 +22,11 @@ _KERAS = {"gamma": "gamma", "beta": "beta", "mean": "moving_mean", "var": "movin
 
 @dataclass(frozen=True)
 class Naming:
-    """How a kind of file names and stores the arrays, and what its networks are unless something else is known.
+    """How a kind of file names and stores arrays, and the usual settings of its networks.
 
-    name:      (layer, array), both canonical, to the name in the file
-    by_output: kernels are stored [out, in, rows, cols] and [out, in], as torch does it
-    biased:    convolutions have a bias
+    name:      function from (layer, array), both canonical, to the name in the file
+    by_output: whether kernels are stored [out, in, rows, cols] and [out, in], as in torch
+    biased:    whether convolutions have a bias
     input:     one of preprocessing.INPUTS
     """
 
@@ -63,7 +63,7 @@ def _torchvision_name(layer: str, array: str) -> str:
 
 
 def _hugging_face_name(layer: str, array: str) -> str:
-    """Names an array as ResNetForImageClassification does (modeling_resnet.py of huggingface/transformers)."""
+    """Returns an array's name in ResNetForImageClassification (modeling_resnet.py of huggingface/transformers)."""
     if layer == "fc1000":
         return "classifier.1.weight" if array == "kernel" else "classifier.1.bias"
     place = "embedder.embedder"
@@ -74,7 +74,7 @@ def _hugging_face_name(layer: str, array: str) -> str:
 
 
 def _detectron_name(layer: str, array: str) -> str:
-    """Names an array as the ResNet of facebookresearch/detectron2 does, whose classifier is called `linear`."""
+    """Returns an array's name in the ResNet of facebookresearch/detectron2, whose classifier is called `linear`."""
     if layer == "fc1000":
         return "linear.weight" if array == "kernel" else "linear.bias"
     place = "stem.conv1"
@@ -100,7 +100,7 @@ def _caffe_name(layer: str, array: str) -> str:
 
 
 def _bare_hugging_face_name(layer: str, array: str) -> str:
-    """Names an array as ResNetModel and ResNetBackbone do."""
+    """Returns an array's name in ResNetModel and ResNetBackbone."""
     return _hugging_face_name(layer, array).removeprefix("resnet.")
 
 
@@ -111,8 +111,8 @@ NAMINGS = (
     Naming("Hugging Face", _bare_hugging_face_name, stride_in="3x3", by_output=True),
     Naming("Detectron2", _detectron_name, by_output=True, input="caffe"),
     Naming("Keras", _keras_name, epsilon=1.001e-5, biased=True, input="caffe"),
-    # Of 2016 to 2018, when Keras left epsilon at its default, with which these weights are the most accurate if the
-    # pool is padded: github.com/keras-team/keras-applications/issues/8.
+    # From 2016 to 2018 Keras left epsilon at its default; with it these weights are the most accurate if the pool is
+    # padded: github.com/keras-team/keras-applications/issues/8.
     Naming("Keras before 2.2", _caffe_name, epsilon=1e-3, biased=True, input="caffe"),
 )
 
@@ -121,10 +121,10 @@ NAMINGS = (
 class Recognised:
     """The network in a file.
 
-    prefix:     before each of its names
+    prefix:     text before each of its names
     expected:   names in the file, with canonical names and stored shapes
-    unexpected: names of arrays that would be parts of another network
-    left_out:   names of arrays that are none of the network's: other heads, other parts of a checkpoint
+    unexpected: names of arrays that would belong to another network
+    left_out:   names of arrays that do not belong to the network: other heads, other parts of a checkpoint
     """
 
     naming: Naming
@@ -141,11 +141,11 @@ class Recognised:
 def recognised(
     found: Mapping[str, Stored], namings: Sequence[Naming], shapes: dict[str, tuple[int, ...]], prefix: str | None
 ) -> Recognised:
-    """Returns the naming and the prefix that most arrays follow.
+    """Returns the network in a file, by the naming and the prefix that most arrays follow.
 
-    shapes: of the network's arrays, with those of a top layer of CLASSES, by canonical name
-    prefix: what the prefix is to begin with, where a file holds several networks
-    Raises InputError when there is no network, or several and no prefix tells them apart.
+    shapes: shapes of the network's arrays and of a top layer of CLASSES, by canonical name
+    prefix: start of the prefix, where a file holds several networks
+    Raises InputError when there is no network, or when there are several that no prefix tells apart.
     """
     best, ties = (0, namings[0], ""), [""]
     for naming in namings:
@@ -165,14 +165,16 @@ def recognised(
         raise InputError(
             f"no array of a ResNet among its {len(found)}{under}; allowed names are, for the first: {known}"
         )
-    if len(ties) > 1 and 2 * count > len(shapes):  # else it is none of them, and what is missing is said
+    if len(ties) > 1 and 2 * count > len(
+        shapes
+    ):  # else the file fits none of them, and the error lists what is missing
         several = ", ".join(shown(repr(tie)) for tie in ties[:4])
         raise InputError(f"holds {len(ties)} networks, whose names begin with {several}: --prefix must say which")
     return _sorted_out(found, naming, start, shapes)
 
 
 def _prefixes(found: Mapping[str, Stored], first: str) -> list[str]:
-    """Returns what stands before the first array's name, wherever it is found."""
+    """Returns every prefix with which the first array's name occurs."""
     starts = [name.removesuffix(first) for name in found if name.endswith(first)]
     return [start for start in starts if not start or start[-1] in "./"]
 
@@ -208,5 +210,5 @@ def _is_other_head(found: Mapping[str, Stored], in_file: Callable[[str], str], n
 
 
 def _are_heads(shapes: list[tuple[int, ...]], features: int) -> bool:
-    """Tells whether arrays can be dense layers, with norms, on a network's features."""
+    """Tells whether arrays may be dense layers, possibly with norms, on a network's features."""
     return all(len(shape) <= 2 for shape in shapes) and any(len(s) == 2 and features in s for s in shapes)

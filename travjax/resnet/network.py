@@ -18,7 +18,7 @@ from travjax.config import require, require_number
 from travjax.resnet.convolution import batch_norm, convolve, max_pool
 
 EXPANSION = 4
-"""A bottleneck puts out this many times its inner channels."""
+"""Output channels of a bottleneck as a multiple of its inner channels."""
 
 _he_normal = nnx.initializers.variance_scaling(2.0, "fan_out", "normal")
 
@@ -62,7 +62,7 @@ class ResNetConfig:
 
 
 class NormConfig(Protocol):
-    """What a batch normalisation needs of a configuration."""
+    """The fields of a configuration that a batch normalisation needs."""
 
     @property
     def epsilon(self) -> float: ...
@@ -87,7 +87,7 @@ class ConvNorm(nnx.Module):
         self.stride, self.padding, self.config = stride, size // 2, config
 
     def __call__(self, images: Float[Array, "b rows cols in"], train: bool) -> Float[Array, "b _rows _cols out"]:
-        """Convolves and normalises; `train` uses the batch's statistics and moves the running ones towards them."""
+        """Convolves and normalises; with `train` by the batch's statistics, which also update the running ones."""
         raw = convolve(images, self.kernel[...].astype(images.dtype), self.stride, self.padding)
         scale, bias, epsilon = self.scale[...], self.bias[...], self.config.epsilon
         if not train:
@@ -143,7 +143,7 @@ class ResNet(nnx.Module):
     ) -> tuple[Float[Array, "b features"], dict[str, Array]]:
         """Returns features, float32, and the activations after the stem's pooling and after each stage, by name.
 
-        train: normalise by the batch's statistics and update the running ones
+        train: whether to normalise by the batch's statistics and update the running ones
         """
         x = max_pool(jax.nn.relu(self.conv1(images.astype(self.config.dtype), train)))
         stages = {"stem": x}

@@ -1,9 +1,9 @@
-"""What pixels a ResNet's weights were made for, and how they are made to take (x / 255 - mean) / std in R, G, B.
+"""The pixel values that a ResNet's weights expect, and their conversion to (x / 255 - mean) / std in R, G, B.
 
-Names in a file do not say it. Two things can be told from its numbers: statistics of 0 and 1 throughout are none that
-were measured, and the variance that a convolution puts out is bounded by its kernel and by what it takes in, so a
-first kernel for pixels up to 255 is not taken for one for values about 1. From the first running means follows the
-mean of the input as well. The order of the colours and the place of the strides leave no mark.
+The names in a file do not tell which values its weights expect, but its numbers tell something. Statistics of 0 and 1
+throughout were never measured. The variance of a convolution's output is bounded by its kernel and its input, so that a
+first kernel for pixels up to 255 is not mistaken for one for values about 1. The first running means also show the mean
+of the input. The order of the colours and the place of the strides leave no trace.
 """
 
 from dataclasses import dataclass
@@ -16,33 +16,35 @@ MEAN = np.array([0.485, 0.456, 0.406])
 STD = np.array([0.229, 0.224, 0.225])
 
 PIXEL_SCALE = 255 * STD.astype(np.float32)
-"""Pixel values from 0 to 255 for one unit of (x / 255 - mean) / std, in the order R, G, B."""
+"""Change in pixel value, on the scale 0 to 255, for one unit of (x / 255 - mean) / std, in the order R, G, B."""
 
 MOST = 49 * float(np.sum((0.5 / STD) ** 2))
-"""Bound on variance out over squares of a 7 x 7 kernel: no pixel from 0 to 1 has a variance above 1/4, and that of a
-weighted sum is at most the sum of the squared weights times that of the variances. 720; a quarter of the filters of
-resnet50_imagenet.npz have 4 and more."""
+"""Upper bound, 720, on the output variance over the sum of squares of a 7 x 7 kernel: a pixel from 0 to 1 has a variance
+of at most 1/4, and a weighted sum has at most the sum of the squared weights times the sum of the variances. A quarter
+of the filters of resnet50_imagenet.npz have a ratio of 4 or more."""
 
 LEAST = 0.02
-"""The same from below, where a quarter of the filters have more in any network: no bound, only filters for the finest
-texture come near it. For values about 1 taken for pixels up to 255, the 4 would be 0.001."""
+"""Ratio that a quarter of the filters exceed in any network. It is not a strict bound, but only filters for the finest
+texture come near it. If values about 1 were mistaken for pixels up to 255, the 4 above would be 0.001."""
 
 EXPLAINED = 0.9
-"""Share of the first running means that the mean of three colours explains, from which on it is believed (0.99 in
+"""Share of the first running means that the mean of three colours must explain to be trusted (0.99 in
 resnet50_imagenet.npz, 0.05 for random numbers)."""
 
 FEWEST = 16
-"""Filters that this takes."""
+"""Fewest filters for which this is tried."""
 
 NEAR = 0.06
-"""Difference of means of colours, in units of (x / 255 - mean) / std; 0.04 in resnet50_imagenet.npz."""
+"""Largest difference between equal means of colours, in units of (x / 255 - mean) / std; 0.04 in
+resnet50_imagenet.npz.
+"""
 
 
 @dataclass(frozen=True)
 class PixelInput:
     """Values of pixels, scale * y + offset where y is (x / 255 - mean) / std; both in the order R, G, B.
 
-    reverse: the first kernel takes B, G, R
+    reverse: whether the first kernel takes B, G, R
     """
 
     text: str
@@ -56,27 +58,27 @@ _ONES, _NONE = np.ones(3, np.float32), np.zeros(3)
 INPUTS = {
     "torch": PixelInput("R, G, B, (x / 255 - mean) / std", _ONES, _NONE),
     "torch-bgr": PixelInput("B, G, R, (x / 255 - mean) / std", _ONES, _NONE, reverse=True),
-    # The means of Keras, 103.939, 116.779, 123.68, and of others are the same to half a unit or one.
+    # The means of Keras, 103.939, 116.779, 123.68, and those of others agree to within one unit.
     "caffe": PixelInput("B, G, R, x - mean, from 0 to 255", PIXEL_SCALE, _NONE, reverse=True),
     "caffe-rgb": PixelInput("R, G, B, x - mean, from 0 to 255", PIXEL_SCALE, _NONE),
     "tf": PixelInput("R, G, B, x / 127.5 - 1", 2 * STD.astype(np.float32), 2 * MEAN - 1),
     "unit": PixelInput("R, G, B, x / 255", STD.astype(np.float32), MEAN),
 }
-"""By the names of Keras' preprocess_input where it has them; mean and std are those of ImageNet."""
+"""Inputs by name, as in Keras' preprocess_input where it has one; mean and std are those of ImageNet."""
 
 MEANS = ("torch", "tf", "unit")
-"""Inputs of values about 1, which their means tell apart."""
+"""Inputs with values about 1, which only their means tell apart."""
 
 CONVERT = "travjax weights --from FILE --input {} takes them as what they are"
 
 FROM_CAFFE = "caffe --stride-in 1x1"
-"""What most weights are that were made from Caffe's: MSRA's and Detectron's, and mmdet's *_caffe."""
+"""Options for most weights converted from Caffe: those of MSRA and Detectron, and *_caffe of mmdet."""
 
 
 def converted(arrays: dict[str, np.ndarray], given: PixelInput) -> dict[str, np.ndarray]:
     """Returns canonical arrays whose first kernel takes R, G, B, (x / 255 - mean) / std.
 
-    The network is the same but at the border, where the padding is of zeros whatever a zero stands for.
+    The network stays the same except at the border, where the padding is zero whatever value zero stands for.
     """
     kernel = arrays["conv1/kernel"][:, :, ::-1] if given.reverse else arrays["conv1/kernel"]
     changed = {"conv1/kernel": kernel * given.scale[:, None]}
@@ -109,7 +111,7 @@ def _of_kinds(arrays: dict[str, np.ndarray], *kinds: str):
 def require_statistics(arrays: dict[str, np.ndarray], names: dict[str, str]) -> None:
     """Raises InputError for trained weights, canonical but for their input, without statistics.
 
-    names: in the file, by canonical name
+    names: names in the file, by canonical name
     """
     if not has_statistics(arrays) and not is_untrained(arrays):
         count = sum(name.endswith("/var") for name in arrays)
@@ -129,7 +131,7 @@ def require_kernel(arrays: dict[str, np.ndarray], names: dict[str, str]) -> None
 def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, str]) -> None:
     """Raises InputError when the first layer of canonical arrays shows that they are made for another input.
 
-    assumed: what they were converted from, one of INPUTS; names: in the file, by canonical name
+    assumed: the input they were converted from, one of INPUTS; names: names in the file, by canonical name
     """
     given = INPUTS[assumed]
     kernel, mean, var = (arrays[f"conv1/{kind}"].astype(np.float64) for kind in ("kernel", "mean", "var"))
@@ -156,8 +158,8 @@ def require_fit(arrays: dict[str, np.ndarray], assumed: str, names: dict[str, st
 def _meant(colours: np.ndarray, assumed: str) -> str | None:
     """Returns the other input that the mean of R, G and B points to, in units of (x / 255 - mean) / std of `assumed`.
 
-    Images of a mean of their own are allowed: from "torch", only what is NEAR another input's mean is one; from "tf"
-    and "unit", whatever is nearer to another's than to theirs.
+    Images may have an unusual mean: from "torch", only a mean NEAR that of another input points to it; from "tf" and
+    "unit", any mean that is nearer to another input's than to their own.
     """
     given = INPUTS[assumed]
     own = "torch" if assumed == "torch-bgr" else assumed

@@ -1,7 +1,7 @@
-"""Arrays in files of weights that are known by name, shape and type before they are read.
+"""Arrays in files of weights, whose names, shapes and types are known before they are read.
 
-What a file says of itself is compared with its size first, so no header makes anything take more memory than the file
-is long, or than the array that is asked for.
+The claims of a file are first compared with its size, so that no header can make reading take more memory than the
+length of the file, or than the array that is asked for.
 """
 
 import math
@@ -18,10 +18,10 @@ import numpy as np
 from travjax.config import InputError
 
 LARGEST = 4 << 30
-"""Bytes that a compressed part of a file may have when it is unfolded, unless it is one of the arrays wanted."""
+"""Most bytes of a decompressed part of a file, unless it is one of the wanted arrays."""
 
 EXPANSION = 100
-"""Times its compressed size that such a part may have; weights hardly shrink at all."""
+"""Largest ratio of decompressed to compressed size of such a part; weights hardly compress at all."""
 
 PIECE = 1 << 20
 
@@ -30,8 +30,8 @@ PIECE = 1 << 20
 class Stored:
     """An array of a file.
 
-    dtype: the name of its type, whatever its byte order: "float32"
-    read:  gives the array; raises InputError, without the path, when that part of the file is damaged
+    dtype: name of its type without byte order, such as "float32"
+    read:  function that returns the array; raises InputError, without the path, when that part of the file is damaged
     """
 
     shape: tuple[int, ...]
@@ -46,11 +46,11 @@ class Stored:
 
 @dataclass(frozen=True)
 class WeightFile:
-    """An open file.
+    """An open file of weights.
 
-    arrays: by their names in the file
-    notes:  what weight_files.write_safetensors was given, {} in other files
-    checked: whether it has checksums, which are then compared as arrays are read
+    arrays:  arrays by their names in the file
+    notes:   notes that weight_files.write_safetensors was given, {} in other files
+    checked: whether it has checksums, which are compared as arrays are read
     """
 
     arrays: dict[str, Stored]
@@ -60,10 +60,10 @@ class WeightFile:
 
 @contextmanager
 def reading(kind: str) -> Iterator[None]:
-    """Turns whatever a library raises over a damaged file into InputError; holds nothing but calls of libraries."""
+    """Turns whatever a library raises for a damaged file into InputError; to be used around library calls only."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on what is refused in the end
+            warnings.simplefilter("ignore")  # about what is refused in the end
             yield
     except InputError:
         raise
@@ -82,9 +82,7 @@ def shown(text: str) -> str:
 
 
 def type_name(dtype: np.dtype) -> str:
-    """Returns the name of a type; NumPy has none for bfloat16, whose arrays it writes as two bytes without a
-    meaning.
-    """
+    """Returns the name of a type; NumPy has no bfloat16, and writes such arrays as two untyped bytes."""
     return "bfloat16" if dtype.kind == "V" and dtype.itemsize == 2 and not dtype.names else dtype.name
 
 
@@ -94,9 +92,7 @@ def as_named(array: np.ndarray) -> np.ndarray:
 
 
 def open_zip(path: Path, kind: str) -> zipfile.ZipFile:
-    """Opens a zip file, once its parts are known to have different names and to be stored as NumPy, torch and Keras
-    do.
-    """
+    """Opens a zip file; raises InputError unless its parts have different names and are stored or deflated."""
     with reading(kind):
         archive = zipfile.ZipFile(path)
     infos = archive.infolist()
@@ -109,9 +105,7 @@ def open_zip(path: Path, kind: str) -> zipfile.ZipFile:
 
 
 def unfolded(archive: zipfile.ZipFile, name: str, kind: str) -> bytes:
-    """Unpacks a part of a zip file; raises InputError when it claims far more than is stored, or is longer than it
-    claims.
-    """
+    """Unpacks a part of a zip file; raises InputError when its claimed size is implausible or too small."""
     info = archive.getinfo(name)
     if info.file_size > min(LARGEST, EXPANSION * info.compress_size):
         raise InputError(
@@ -120,7 +114,7 @@ def unfolded(archive: zipfile.ZipFile, name: str, kind: str) -> bytes:
         )
     content = bytearray()
     with reading(kind), archive.open(info) as file:
-        while piece := file.read(PIECE):  # read whole, zipfile would unfold before it looks at the size
+        while piece := file.read(PIECE):  # a single read would decompress before checking the size
             content += piece
     return bytes(content)
 

@@ -1,4 +1,4 @@
-"""Arrays by name out of files of weights: .npz, safetensors, .pth, of which no pickled code is run, and Keras' files.
+"""Reads arrays by name from files of weights: .npz, safetensors, .pth, without running pickled code, and Keras files.
 
 Files that travjax writes are .safetensors with the SHA-256 of each array and of the notes in their header.
 """
@@ -23,13 +23,13 @@ SUMS = "sha256"
 """Key of the checksums beside the notes."""
 
 NOTES = "__metadata__"
-"""Whose checksum is that of the notes; safetensors allows no array of that name."""
+"""Key of the checksum of the notes; safetensors allows no array of that name."""
 
 _LETTERS = {"F": "float", "I": "int", "U": "uint"}
 
 TYPES = {f"{letter}{bits}": f"{kind}{bits}" for letter, kind in _LETTERS.items() for bits in (8, 16, 32, 64)}
 TYPES |= {"BF16": "bfloat16", "BOOL": "bool"}
-"""Names of types in safetensors and elsewhere."""
+"""Names of types in safetensors, and their NumPy names."""
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def open_arrays(path: Path) -> Iterator[WeightFile]:
     """Opens a file of weights, whose arrays can be read as long as it is open.
 
     Raises InputError, without the path, when the file is missing, of no known kind or damaged, needs code to be run,
-    points to other files, or claims what its size does not bear out.
+    points to other files, or claims more than its size allows.
     """
     suffix = path.suffix.lower()
     if suffix not in READERS:
@@ -56,7 +56,7 @@ def open_arrays(path: Path) -> Iterator[WeightFile]:
 
 
 def _require_content(path: Path, suffix: str) -> None:
-    """Raises InputError for what often lies where weights should: nothing, a pointer to them, a page of a server."""
+    """Raises InputError for files that often replace weights by mistake: empty ones, Git LFS pointers, web pages."""
     with reading(suffix), path.open("rb") as file:
         start = file.read(512)
     if not start:
@@ -70,20 +70,22 @@ def _require_content(path: Path, suffix: str) -> None:
 def write_safetensors(path: Path, arrays: dict[str, np.ndarray], notes: dict) -> None:
     """Writes arrays, notes (numbers and texts) and the checksums of both, whole or not at all.
 
-    Raises InputError that names an array of which a number is not finite.
+    Raises InputError that names an array with a number that is not finite.
     """
     from safetensors.numpy import save
 
     for name, array in arrays.items():
         require_finite(f"{path}: {name}", array)
     sums = {NOTES: _sum_of_notes(notes)} | {name: _sum_of(array) for name, array in arrays.items()}
-    header = {"travjax": json.dumps(notes | {SUMS: sums})}  # one entry: safetensors writes several in any order
+    header = {
+        "travjax": json.dumps(notes | {SUMS: sums})
+    }  # a single entry, since safetensors writes several in any order
     with atomic_write(path) as temporary:
-        temporary.write_bytes(save(arrays, metadata=header))  # save_file hides it from others
+        temporary.write_bytes(save(arrays, metadata=header))  # save_file would make it unreadable for others
 
 
 def require_finite(what: str, array: np.ndarray) -> None:
-    """Raises InputError that names the first number of an array that is none."""
+    """Raises InputError that names the first number of an array that is not finite."""
     finite = np.isfinite(array)
     if not finite.all():
         value = float(array.flat[int(np.argmin(finite))])
@@ -172,14 +174,14 @@ def _check_torch_zip(path: Path) -> None:
 
 
 def _tensors(state: Any, kind: type) -> dict[str, Any]:
-    """Tensors of dicts in dicts, their keys joined by dots; a dict that is there twice counts once."""
+    """Returns the tensors of nested dicts, with keys joined by dots; a dict that occurs twice counts once."""
     found: dict[str, Any] = {}
     waiting, seen = deque([("", state)]), {id(state)}
     while waiting:
         place, holder = waiting.popleft()
         for key, value in holder.items() if isinstance(holder, dict) else ():
             if not isinstance(key, str):
-                continue  # an optimizer's, which numbers its parameters
+                continue  # parameters of an optimizer, which numbers them
             if isinstance(value, kind):
                 if place + key in found:
                     raise InputError(f"holds {shown(place + key)} twice: must be one")
@@ -200,4 +202,4 @@ def _stored_tensor(tensor: Any, kind: str) -> Stored:
 
 READERS = {".npz": _npz, ".h5": open_hdf5, ".hdf5": open_hdf5, ".keras": open_keras, ".safetensors": _safetensors}
 READERS |= dict.fromkeys((".pth", ".pt", ".bin", ".ckpt", ".tar"), _torch)
-"""What is read, by the ending of the name; .tar is torch's .pth.tar."""
+"""Functions that open a file, by its suffix; .tar is torch's .pth.tar."""
