@@ -19,9 +19,9 @@ PIXEL_SCALE = 255 * STD.astype(np.float32)
 """Change in pixel value, on the scale 0 to 255, for one unit of (x / 255 - mean) / std, in the order R, G, B."""
 
 MOST = 49 * float(np.sum((0.5 / STD) ** 2))
-"""Upper bound, 720, on the output variance over the sum of squares of a 7 x 7 kernel: a pixel from 0 to 1 has a variance
-of at most 1/4, and a weighted sum has at most the sum of the squared weights times the sum of the variances. A quarter
-of the filters of resnet50_imagenet.npz have a ratio of 4 or more."""
+"""Upper bound, 720, on the output variance over the sum of squares of a 7 x 7 kernel: a pixel from 0 to 1 has a
+variance of at most 1/4, and a weighted sum has at most the sum of the squared weights times the sum of the variances. A
+quarter of the filters of resnet50_imagenet.npz have a ratio of 4 or more."""
 
 LEAST = 0.02
 """Ratio that a quarter of the filters exceed in any network. It is not a strict bound, but only filters for the finest

@@ -1,8 +1,8 @@
 """Landforms of natural ground: fractal relief, rocks, craters, ledges and wheel ruts, each by rules of the literature.
 
 Every function draws from its own generator and works on the `Nodes` of a raster. Most return what they add to the
-ground, [rows, cols] float64 metres; rocks are laid on the existing ground. Everything except the fractal relief is drawn
-in metres, so that the same landforms come out at any spacing of the nodes.
+ground, [rows, cols] float64 metres; rocks are laid on the existing ground. Everything except the fractal relief is
+drawn in metres, so that the same landforms come out at any spacing of the nodes.
 """
 
 import math
@@ -231,8 +231,8 @@ def crater_profile(radii: np.ndarray, diameter: float, freshness: float) -> np.n
     """Returns the height of a crater [m] at distances from its middle, in units of its radius.
 
     freshness: 1 for a new crater, less for a levelled one, which is shallower, with a lower and rounded rim
-    A new crater is a parabolic bowl with a rim, and ejecta that fall off with the third power (McGetchin et al. 1973, Earth
-    Planet. Sci. Lett. 20, 226-236). Sources: Pike (1977), Impact and Explosion Cratering, 489-509; Melosh (1989),
+    A new crater is a parabolic bowl with a rim, and ejecta that fall off with the third power (McGetchin et al. 1973,
+    Earth Planet. Sci. Lett. 20, 226-236). Sources: Pike (1977), Impact and Explosion Cratering, 489-509; Melosh (1989),
     Impact Cratering.
     """
     depth, rim = CRATER_DEPTH * diameter * freshness, CRATER_RIM * diameter * freshness

@@ -129,9 +129,7 @@ RANGES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
     "scattered_sharp": (_SHARP, _SHARP),
 }
-"""Parameters for the two halves of each style's maps: a number, or the ends of a uniform distribution (SPEC section
-2).
-"""
+"""For the two halves of each style's maps, parameters as numbers or ends of uniform distributions (SPEC section 2)."""
 
 STYLES = tuple(RANGES)
 
