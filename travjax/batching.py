@@ -1,5 +1,5 @@
-"""Work on many maps in batches: of a few fixed sizes, so that few shapes are compiled, and with results that do not
-depend on the batch.
+"""Processes many maps in batches of a few fixed sizes, so that few shapes are compiled and results do not depend on the
+batch.
 """
 
 from collections.abc import Callable
@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 BATCH = 32
-"""Maps worked on at once: more gains nothing on a CPU and costs memory."""
+"""Maps in a batch: more gains nothing on a CPU and costs memory."""
 
 
 def in_batches(function: Callable[[Any], Any], items: Any) -> Any:
     """Applies `function` to batches of `items` and puts the results together.
 
-    items: a pytree of arrays with a common leading axis [n, ...]; so are the results. A batch is BATCH items, the last
-    one the power of two that holds the rest, filled up by repeating its first item.
+    items: a pytree of arrays with a common leading axis [n, ...]; so are the results. A batch has BATCH items; the
+    last one has the power of two that holds the rest, padded by repeating its first item.
     """
     count = len(jax.tree.leaves(items)[0])
     results = []
@@ -36,8 +36,8 @@ def _filled(item: jax.Array, missing: int) -> jax.Array:
 def rounded(product: Float[Array, "*s"]) -> Float[Array, "*s"]:
     """Returns a product that is rounded before it is added to something.
 
-    XLA repeats cheap expressions in several loops and joins multiply and add in some of them only, and where two
-    products are added it joins either; the last bits would then hang on the form of the loop.
-    The bound is never reached, which no optimiser knows.
+    XLA repeats cheap expressions in several loops and fuses multiply and add in only some of them, and where two
+    products are added it may fuse either; the last bits would then depend on the form of the loop.
+    The bound is never reached, but the optimiser cannot know that.
     """
     return jnp.maximum(product, -1e30)

@@ -1,4 +1,4 @@
-"""The command `travjax`; commands/ holds what it can do, and entry.py says what is wrong with bad input."""
+"""The command `travjax`; its subcommands are in commands/, and entry.py reports bad input."""
 
 import argparse
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from travjax.config import naming
 from travjax.entry import Parser, guarded, use_compilation_cache
 
 COMMANDS = (terrain, label, dataset, weights, train, evaluate, export, predict, bench)
-"""In the order in which the help lists them."""
+"""The commands in the order in which the help lists them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""What every configuration shares: one-line errors, and TOML and JSON files that are checked when they are read.
+"""Shared by all configurations: one-line errors, and TOML and JSON files that are checked when they are read.
 
 A configuration is a frozen dataclass of numbers, strings and tuples in SI units and radians. In a TOML file an angle
 may be given in degrees, by a key that ends in `_deg`; everything else is named as the field is. A field with the
@@ -27,16 +27,16 @@ Renamed = dict[str, str]
 """Old keys that were read, and what they are called now."""
 
 LONGEST = 600
-"""Characters of a message, and of a name that is printed; the middle of a longer one is left out."""
+"""Most characters of a message, and of a printed name; the middle of a longer one is left out."""
 
 QUOTED = 80
-"""Characters of a value in a message."""
+"""Most characters of a value in a message."""
 
 LARGEST = 64 << 20
-"""Bytes of a text file of ours."""
+"""Largest text file that is read, in bytes."""
 
 DEEPEST = 50
-"""Lists and tables within each other in a text file of ours, which has four at most."""
+"""Deepest nesting of lists and tables in a text file that is read; valid ones have at most four levels."""
 
 
 class InputError(ValueError):
@@ -47,7 +47,7 @@ class InputError(ValueError):
 
 
 def one_line(text: object, most: int = LONGEST) -> str:
-    """Returns a text as it is printed: line breaks and all else that is not printable escaped, and not too long."""
+    """Returns a text for printing: everything not printable is escaped, and a long text is shortened."""
     whole = str(text)
     plain = whole if whole.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in whole)
     end = most // 3
@@ -55,11 +55,11 @@ def one_line(text: object, most: int = LONGEST) -> str:
 
 
 def shown(value: object) -> str:
-    """Returns a value as messages quote it: its repr in one line, cut off where it is long."""
+    """Returns a value as messages quote it: its repr in one line, shortened if it is long."""
     plain = value.item() if isinstance(value, np.generic) else value
     try:
         text = repr(plain)
-    except (ValueError, RecursionError):  # a whole number of thousands of digits, lists within lists
+    except (ValueError, RecursionError):  # whole numbers of thousands of digits, deeply nested lists
         text = hex(plain) if isinstance(plain, int) else f"a {type(plain).__name__}"
     text = " ".join(text.split())
     return text if len(text) <= QUOTED else f"{text[: QUOTED - 4]} ..."
@@ -88,10 +88,10 @@ def require_length(field: str, value: object, low: float, high: float) -> None:
 
 @contextmanager
 def naming(what: object) -> Iterator[None]:
-    """Notes on an error for lack of memory what was being read or made; programs say it in their one line."""
+    """Adds to an out-of-memory error a note on what was being read or made, which programs print in their one line."""
     try:
         yield
-    except (MemoryError, RuntimeError) as error:  # the latter XLA's
+    except (MemoryError, RuntimeError) as error:  # XLA raises the latter
         error.add_note(str(what))
         raise
 
@@ -123,7 +123,7 @@ def say_renamed(where: object, older: Mapping[str, str]) -> None:
 
 
 def read_json(path: Path, allowed: str = "", finite: bool = True) -> Any:
-    """Reads a JSON file of ours; what is wrong with it is an InputError that names it, as `read_text` says."""
+    """Reads a JSON file that travjax wrote; raises InputError that names the file, like `read_text`."""
     return parse_json(read_text(path, allowed), path, finite)
 
 
@@ -137,10 +137,9 @@ def parse_json(text: str, where: object, finite: bool = True) -> Any:
 
 
 def read_text(path: Path, allowed: str = "") -> str:
-    """Reads a text file of ours.
+    """Reads a text file.
 
-    Raises InputError that names it when it is missing, in which case it also says what is allowed, too large or not
-    UTF-8.
+    Raises InputError that names the file when it is too large, not UTF-8, or missing; then it says what is allowed.
     """
     data = bytearray()
     try:
@@ -159,12 +158,12 @@ def read_text(path: Path, allowed: str = "") -> str:
 
 
 def _parsed(where: object, text: str, parse: Callable[[str], Any], kind: str, finite: bool) -> Any:
-    """Parses a text, once it is known to hold nothing that no file of ours holds."""
+    """Parses a text and checks that it holds nothing that no valid file holds."""
     try:
         found = parse(text)
     except RecursionError:
         raise InputError(f"{where}: lists and tables: must be nested {DEEPEST} deep at most") from None
-    except Exception as error:  # the parser's own, and what Python says of a number of thousands of digits
+    except Exception as error:  # the parser's errors, and Python's for numbers of thousands of digits
         if number := re.search(r"\d[\d_]{999,}", text):
             line, digits = text.count("\n", 0, number.start()) + 1, f"{number[0][:20]} ..."
             raise InputError(f"{where}: line {line}: {digits}: must be a number of fewer digits") from None
@@ -177,7 +176,7 @@ def _parsed(where: object, text: str, parse: Callable[[str], Any], kind: str, fi
 
 
 def _require_plain(found: object, finite: bool) -> None:
-    """Refuses whole numbers beyond 64 bits, deep nesting, and with `finite` numbers that are not, by name."""
+    """Raises InputError for whole numbers beyond 64 bits, deep nesting and, with `finite`, numbers that are not."""
     level: list[tuple[str, object]] = [("", found)]
     for _ in range(DEEPEST):
         inner: list[tuple[str, object]] = []
@@ -197,8 +196,8 @@ def _require_plain(found: object, finite: bool) -> None:
 
 
 def to_json(config: object) -> dict[str, Any]:
-    """Converts a configuration dataclass to what JSON can hold: tuples become lists, and infinite numbers in them
-    "inf".
+    """Converts a configuration dataclass to what JSON can hold: tuples become lists, with "inf" for infinity
+    in them.
     """
 
     def plain(value):

@@ -1,7 +1,7 @@
-"""Devices that share the work: one, several of a host, or those of several processes, by the same code.
+"""Devices that share the work: one, several of a host, or those of several processes, with the same code.
 
-A batch is cut into equal parts along its first axis, one for each device; everything else is on all of them. Under
-`jit` that is all there is to data-parallel training: XLA adds the sums over devices, batch statistics included.
+A batch is cut into equal parts along its first axis, one for each device; everything else is replicated. Under `jit`
+nothing more is needed for data-parallel training: XLA adds the sums over devices, including batch statistics.
 """
 
 from dataclasses import dataclass
@@ -34,12 +34,12 @@ class Devices:
 
     @property
     def main(self) -> bool:
-        """Whether this process is the one that writes and prints."""
+        """Whether this process is the one that writes files and prints."""
         return jax.process_index() == 0
 
     @cached_property
     def everywhere(self) -> NamedSharding:
-        """The whole array on each device."""
+        """The sharding that puts the whole array on each device."""
         return NamedSharding(self.mesh, PartitionSpec())
 
     @cached_property
@@ -47,11 +47,11 @@ class Devices:
         return NamedSharding(self.mesh, PartitionSpec("batch"))
 
     def replicate(self, tree: PyTree) -> PyTree:
-        """Arrays, the same in each process, on all devices."""
+        """Puts arrays, the same in each process, on all devices."""
         return jax.tree.map(lambda array: _placed(array, self.everywhere), tree)
 
     def shard(self, tree: PyTree) -> PyTree:
-        """Arrays [b, ...], the same in each process, a part on each device."""
+        """Splits arrays [b, ...], the same in each process, and puts a part on each device."""
         return jax.tree.map(lambda array: _placed(array, self._in_parts), tree)
 
     def fetch(self, array: jax.Array) -> np.ndarray:
@@ -61,7 +61,7 @@ class Devices:
         return np.asarray(multihost_utils.process_allgather(array, tiled=True))
 
     def wait(self) -> None:
-        """Waits until all processes have come here."""
+        """Waits until all processes have reached this call."""
         if jax.process_count() > 1:
             multihost_utils.sync_global_devices("travjax")
 
@@ -79,10 +79,10 @@ def _placed(array, sharding: NamedSharding) -> jax.Array:
 
 
 def join(coordinator: str, processes: int, process: int) -> None:
-    """Joins the processes of a run; to be called before anything else is asked of JAX.
+    """Joins the processes of a run; to be called before JAX is used in any other way.
 
     coordinator: address:port of process 0; processes: how many there are; process: which of them this is, from 0
-    Raises InputError for arguments that cannot be. When the processes do not find each other, JAX ends them.
+    Raises InputError for invalid arguments. When the processes do not find each other, JAX ends them.
     """
     whole = lambda value: isinstance(value, int) and not isinstance(value, bool)
     require(whole(processes) and processes >= 1, "--processes", processes, "at least 1")

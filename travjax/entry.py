@@ -1,6 +1,6 @@
-"""What every program of travjax shares: one line for bad input, exit codes, the compilation cache, and a quiet XLA.
+"""Shared by all programs of travjax: one line for bad input, exit codes, the compilation cache, and a quiet XLA.
 
-JAX is imported where it is used, since `quiet_xla` has to come before it.
+JAX is imported only where it is used, because `quiet_xla` has to run first.
 """
 
 import argparse
@@ -20,41 +20,41 @@ from travjax.files import cache_folder, output_folder
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
+    """A parser that reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
         raise InputError(f"{message} (see {self.prog} --help)")
 
 
 def quiet_xla() -> None:
-    """Leaves only fatal errors of XLA to print, unless TF_CPP_MIN_LOG_LEVEL says otherwise; before JAX is imported.
+    """Lets XLA print only fatal errors, unless TF_CPP_MIN_LOG_LEVEL is set; to be called before JAX is imported.
 
-    When it reads compiled code back from the cache, XLA logs an error over two tuning hints that are no processor
+    When XLA reads compiled code from the cache, it logs an error about two tuning hints that are not processor
     features ("+prefer-no-gather is not supported on the host machine").
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
 def settle_streams() -> None:
-    """Opens standard streams that were closed, or a file would take their place; none refuses a letter."""
+    """Opens closed standard streams, lest a file take their place, and makes all of them accept any character."""
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
     sys.stdout, sys.stderr = _settled(sys.stdout, 1), _settled(sys.stderr, 2)
 
 
 def _settled(stream: IO[str] | None, number: int) -> IO[str]:
-    """Returns the stream, or one in place of none; it escapes letters of file names that its encoding lacks."""
+    """Returns the stream, or a new one if there is none; it escapes characters that its encoding lacks."""
     stream = stream or open(number, "w", closefd=False)
-    if hasattr(stream, "reconfigure"):  # not that of a test
+    if hasattr(stream, "reconfigure"):  # a stream of a test may lack it
         stream.reconfigure(errors="backslashreplace")
     return stream
 
 
 def guarded(work: Callable[[], object]) -> int:
-    """Does the work of a program; returns the exit code, 2 for bad input, which is said in one line."""
+    """Runs a program; returns the exit code, 2 for bad input, which is reported in one line."""
     settle_streams()
     with signals.raised():
         try:
@@ -65,24 +65,24 @@ def guarded(work: Callable[[], object]) -> int:
             sys.stdout.flush()
         except InputError as error:
             return _ended(2, str(error))
-        except BrokenPipeError:  # the reader of our output has gone
+        except BrokenPipeError:  # nobody reads the output any more
             _drop_output()
             return 1
-        except OSError as error:  # a name too long, no permission
+        except OSError as error:  # a name that is too long, no permission
             return _ended(2, f"{error.filename or 'a file'}: {error.strerror or error}")
         except (MemoryError, RuntimeError) as error:
-            if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # XLA's
+            if isinstance(error, RuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):  # raised by XLA
                 raise
             return _ended(2, _out_of_memory(error))
         except KeyboardInterrupt as error:
-            warnings.simplefilter("ignore")  # Python's, of coroutines that were cut off
+            warnings.simplefilter("ignore")  # Python warns about interrupted coroutines
             return _ended(*signals.ending(error))
     return 0
 
 
 def _ended(code: int, line: str) -> int:
-    """Says in one line why a program ends; returns its exit code."""
-    with suppress(OSError):  # nobody is there to read it
+    """Prints in one line why a program ends; returns its exit code."""
+    with suppress(OSError):  # nobody may be there to read it
         print(one_line(f"travjax: {line}"), file=sys.stderr)
     try:
         sys.stdout.flush()
@@ -92,12 +92,12 @@ def _ended(code: int, line: str) -> int:
 
 
 def _drop_output() -> None:
-    """Lets what is still to be printed go nowhere, so that Python does not try again at its end."""
+    """Discards output that is still to be printed, so that Python does not try again when it exits."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _out_of_memory(error: MemoryError | RuntimeError) -> str:
-    """Returns one line; the error's first note, of `config.naming`, says what was read or made."""
+    """Returns one line on an out-of-memory error; its first note, by `config.naming`, says what was read or made."""
     what = "".join(f"{note}: " for note in getattr(error, "__notes__", [])[:1])
     reason = str(error).partition("\n")[0][:200]
     return f"{what}out of memory{reason and ': '}{reason}; try fewer maps or a smaller batch_size"
@@ -119,11 +119,11 @@ def use_compilation_cache() -> None:
             return
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")  # a full disk
+    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")  # a full disk causes them
 
 
 def _give_matplotlib_a_folder() -> None:
-    """Gives it a folder, since it fails without a home and says much of one that cannot be written to."""
+    """Gives matplotlib a folder; it fails without a home, and prints warnings if it cannot write there."""
     if "MPLCONFIGDIR" not in os.environ:
         os.environ["MPLCONFIGDIR"] = tempfile.mkdtemp(prefix="travjax-matplotlib-")
         atexit.register(shutil.rmtree, os.environ["MPLCONFIGDIR"], ignore_errors=True)

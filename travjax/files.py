@@ -1,7 +1,7 @@
-"""Files that are written whole or not at all, and the places that a user names.
+"""Files that are written whole or not at all, and paths that a user gives.
 
-What is being written lies in a hidden folder beside its place, .travjax-unfinished-XXXXXXXX, which is locked as long as
-its process lives. The next process that writes there removes those of dead ones.
+A file is first written to a hidden folder beside its place, .travjax-unfinished-XXXXXXXX, which is locked as long as
+its process lives. The next process that writes there removes such folders of dead processes.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from travjax.locks import lock_file
 UNFINISHED = ".travjax-unfinished-"
 LOCK = ".travjax-lock"
 REPLACED = ".travjax-replaced"
-"""Names of ours: of a folder for what is being written; in it, of its lock, and of what is replaced by two renames."""
+"""Names of a folder for unfinished files and, within it, of its lock and of a folder being replaced by renames."""
 
 PRESETS = Path(__file__).parent / "presets"
 """The presets that come with the package, in a folder for each kind."""
@@ -46,8 +46,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
 def atomic_write_folder(folder: Path, replaceable: Callable[[Path], bool]) -> Iterator[Path]:
     """Yields a temporary folder to write to, which becomes `folder` when the block ends well and is removed otherwise.
 
-    At any moment the old or the new one is in its place, where the file system can exchange two names; elsewhere the
-    next process that writes there, or that looks for it by `put_back`, brings back the old one after a kill.
+    Where the file system can exchange two names, either the old or the new folder is in place at any moment; elsewhere,
+    if the process is killed, the next one that writes there or calls `put_back` restores the old folder.
     Raises InputError when it cannot be written, or when a file or a folder that is not `replaceable` lies there.
     """
     place = resolved(folder)
@@ -69,7 +69,7 @@ def atomic_write_folder(folder: Path, replaceable: Callable[[Path], bool]) -> It
 
 
 def put_back(folder: Path) -> None:
-    """Brings back a folder that a process was replacing when it was killed."""
+    """Restores a folder that a process was replacing when it was killed."""
     place = resolved(folder)
     if not place.exists():
         _remove_remains(place.parent)
@@ -92,7 +92,7 @@ def _unfinished(folder: Path) -> Iterator[Path]:
         yield place
     finally:
         _bring_back_replaced(place)
-        lock.close()  # network file systems keep open files, and so their folder
+        lock.close()  # network file systems keep open files, and with them their folder
         shutil.rmtree(place, ignore_errors=True)
 
 
@@ -101,7 +101,7 @@ def _locked_folder(folder: Path) -> tuple[Path, IO[str]]:
         place = Path(tempfile.mkdtemp(prefix=UNFINISHED, dir=folder))
         try:
             lock, locked = lock_file(place / LOCK)
-        except FileNotFoundError:  # taken for remains, as yet without a lock, by another process
+        except FileNotFoundError:  # another process took the folder, not yet locked, for remains
             continue
         except OSError:
             shutil.rmtree(place, ignore_errors=True)
@@ -112,7 +112,7 @@ def _locked_folder(folder: Path) -> tuple[Path, IO[str]]:
 
 
 def _remove_remains(folder: Path) -> None:
-    """Removes from a folder what processes that are dead were writing there."""
+    """Removes from a folder the unfinished files of dead processes."""
     with suppress(OSError):
         found = [place for place in folder.iterdir() if re.fullmatch(rf"{re.escape(UNFINISHED)}\w{{8}}", place.name)]
         for place in found:
@@ -120,17 +120,17 @@ def _remove_remains(folder: Path) -> None:
 
 
 def _remove_if_dead(place: Path) -> None:
-    with suppress(OSError):  # not ours to remove, or removed by another process meanwhile
+    with suppress(OSError):  # no permission, or another process removed it meanwhile
         lock, locked = lock_file(place / LOCK)
         with lock:
             if locked:
                 _bring_back_replaced(place)
                 shutil.rmtree(place, ignore_errors=True)
-        place.rmdir()  # what network file systems had kept
+        place.rmdir()  # network file systems may have kept it
 
 
 def _bring_back_replaced(unfinished: Path) -> None:
-    """Moves a folder whose place was to be taken back, where nothing has taken it."""
+    """Moves a folder that was to be replaced back to its place, if that is free."""
     with suppress(OSError):
         for old in (unfinished / REPLACED).iterdir():
             if not os.path.lexists(unfinished.parent / old.name):
@@ -138,7 +138,7 @@ def _bring_back_replaced(unfinished: Path) -> None:
 
 
 def _exchanged(one: Path, other: Path) -> bool:
-    """Exchanges two names at once, and returns whether the system and the file system can."""
+    """Exchanges two names atomically; returns False where the system or the file system cannot."""
     here, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE of Linux
     try:
         rename = ctypes.CDLL(None).renameat2
@@ -153,10 +153,10 @@ _HELD: set[Path] = set()
 
 @contextmanager
 def held(folder: Path, option: str = "--out") -> Iterator[None]:
-    """Keeps a folder, which is made if need be, for this process while the block runs; it may do so within as well.
+    """Reserves a folder, made if need be, for this process while the block runs; the block may reserve it again.
 
-    option: what a message calls the folder
-    Raises InputError that names process and host when another process keeps it, or when it cannot be written to.
+    option: name of the folder in messages
+    Raises InputError that names process and host when another process has it, or when it cannot be written to.
     """
     place = resolved(folder)
     if place in _HELD:
@@ -172,7 +172,7 @@ def held(folder: Path, option: str = "--out") -> Iterator[None]:
                 raise InputError(
                     f"{option} {folder}: in use by {_holder(lock)}; allowed: a folder that no other run uses"
                 )
-            with suppress(OSError):  # a full disk is reported by what is written next
+            with suppress(OSError):  # the next write reports a full disk
                 lock.truncate(0)
                 lock.write(f"process {os.getpid()} on {socket.gethostname()}")
                 lock.flush()
@@ -184,7 +184,7 @@ def held(folder: Path, option: str = "--out") -> Iterator[None]:
                 path.unlink(missing_ok=True)
     finally:
         if new:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # it may not be empty
                 place.rmdir()
 
 
@@ -194,7 +194,7 @@ def _holder(lock: IO[str]) -> str:
 
 
 def output_folder(path: str | Path) -> Path:
-    """Creates the folder if need be, and removes what processes that are dead were writing there.
+    """Creates the folder if need be, and removes the unfinished files of dead processes in it.
 
     Raises InputError when it cannot be written to.
     """
@@ -211,10 +211,9 @@ def output_folder(path: str | Path) -> Path:
 
 
 def require_replaceable(path: Path, ours: Callable[[Path], bool], option: str, what: str) -> None:
-    """Refuses to replace a file that nobody named and that is not `ours`.
+    """Raises InputError where a file that the user did not name and travjax did not write would be replaced.
 
-    option: what led to its name, and its value; what: what would be written
-    Raises InputError.
+    option: option that led to its name, and its value; what: the thing that would be written
     """
     if os.path.lexists(path) and not (path.is_file() and ours(path)):
         raise InputError(
@@ -240,7 +239,7 @@ def resolved(path: Path) -> Path:
     """Returns the path without symbolic links. Raises InputError when one of them leads to itself."""
     try:
         return path.resolve()
-    except (OSError, RuntimeError):  # the latter up to Python 3.12
+    except (OSError, RuntimeError):  # the latter occurs up to Python 3.12
         raise InputError(f"{path}: a symbolic link that leads to itself; allowed: a folder, or a new one") from None
 
 
@@ -260,7 +259,7 @@ def find_data(name: str, what: str, allowed: str = "a file here or under TRAVJAX
 def find_preset(given: str | Path, kind: str) -> Path:
     """Returns the file of a preset that is given by its path, or by a name such as "laptop" in PRESETS/KIND.
 
-    Raises InputError, which lists the names, when there is no preset of that name. A path is not looked at.
+    Raises InputError, which lists the names, when there is no preset of that name. A path is returned unchecked.
     """
     if Path(given).suffix.lower() == ".toml":
         return user_path(given)
@@ -271,21 +270,23 @@ def find_preset(given: str | Path, kind: str) -> Path:
 
 
 def sha256(path: Path) -> str:
-    """Returns the SHA-256 of a file in hexadecimal; the file is read piece by piece."""
+    """Returns the SHA-256 of a file in hexadecimal; reads the file piece by piece."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def cache_folder() -> Path | None:
-    """Returns the folder for what can be made again, or None for a user without a home."""
+    """Returns the user's cache folder for files that can be made again, or None for a user without a home."""
     home = os.path.expanduser("~") if os.environ.get("HOME") != "" else ""
     given = os.environ.get("XDG_CACHE_HOME", "")
-    place = given if os.path.isabs(given) else os.path.join(home, ".cache")  # the standard has relative ones ignored
+    place = (
+        given if os.path.isabs(given) else os.path.join(home, ".cache")
+    )  # the XDG standard says to ignore relative paths
     return Path(place) / "travjax" if os.path.isabs(place) else None
 
 
 def save_text(path: Path, text: str) -> Path:
-    """Writes a text file, whole or not at all; what UTF-8 has no letter for, as in names of files, is escaped."""
+    """Writes a text file, whole or not at all; characters of file names that UTF-8 lacks are escaped."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
     return path

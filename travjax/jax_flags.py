@@ -1,8 +1,8 @@
-"""JAX's global flags do not reach results: seeds, files and margins are the same whatever an application has set.
+"""Keeps JAX's global flags from changing results: margins and files are the same whatever an application has set.
 
-An application may want 64-bit numbers, another random number generator or strict promotion for code of its own, by
-`jax.config` or JAX_... in the environment. Random numbers hang on such flags as well as types and rounding do. What
-computes here says its types and keys itself and runs within `usual_flags`, for what only a flag can say.
+An application may choose 64-bit numbers, another random number generator or strict promotion for its own code, by
+`jax.config` or JAX_... in the environment. Such flags change random numbers as well as types and rounding. The code
+here therefore states its types and keys, and runs within `usual_flags` for everything that only a flag controls.
 """
 
 from collections.abc import Iterator
@@ -27,12 +27,12 @@ _USUAL = (
     partial(jax.debug_infs, False),
     partial(jax.transfer_guard, "allow"),  # NumPy arrays come in and go out
 )
-"""What reaches results, or would raise an error over what is meant here, as JAX has it when nothing is set."""
+"""The defaults of the JAX flags that change results, or that raise errors for code that is correct here."""
 
 
 @contextmanager
 def usual_flags() -> Iterator[None]:
-    """Runs what is within, or the function that it decorates, as if no flag of JAX had been set; in this thread."""
+    """Runs a block, or the function that it decorates, as if no JAX flag had been set; applies to this thread only."""
     with ExitStack() as stack:
         for setting in _USUAL:
             stack.enter_context(setting())

@@ -1,6 +1,6 @@
-"""Locks of the operating system on files: they end with the process that has them, however it ends.
+"""File locks of the operating system: they end with the process that holds them, however it ends.
 
-A process id tells nothing of who is alive: each container has a process 1, and hosts share volumes.
+A process id does not show whether a process is alive: each container has a process 1, and hosts share volumes.
 """
 
 import fcntl
@@ -12,15 +12,15 @@ from typing import IO
 def lock_file(path: Path) -> tuple[IO[str], bool | None]:
     """Opens a file, which is made if need be, and locks it until it is closed.
 
-    Returns the file, and True, False where another process has it locked, or None where there are no locks: some file
-    systems have none. Raises OSError when it cannot be opened.
+    Returns the file, and True if it is locked, False if another process holds the lock, or None where the file system
+    has no locks. Raises OSError when it cannot be opened.
     """
     while True:
         file = path.open("a+", encoding="utf-8", errors="replace")
         locked = _lock(file)
         if locked is False or _lies_at(file, path):
             return file, locked
-        file.close()  # removed by the process that had it locked until now
+        file.close()  # the process that held the lock has removed it
 
 
 def _lock(file: IO[str]) -> bool | None:

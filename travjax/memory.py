@@ -1,4 +1,4 @@
-"""What fits: memory and disk are compared with what a piece of work will take before it is begun."""
+"""Checks, before work begins, whether memory and disk are large enough for it."""
 
 import os
 import shutil
@@ -8,14 +8,14 @@ from pathlib import Path
 from travjax.config import InputError
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
-"""Where Linux says how much memory a container may take."""
+"""File in which Linux states how much memory a container may use."""
 
 
 def available() -> int:
-    """Returns the bytes of memory that may be taken now, as far as the system says."""
+    """Returns the bytes of memory that are available now, as far as the system tells."""
     try:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError):  # Windows: nothing is known, and nothing refused
+    except (AttributeError, ValueError):  # on Windows nothing is known, and nothing refused
         return sys.maxsize
     try:
         fields = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
@@ -30,7 +30,7 @@ def available() -> int:
 
 
 def require_memory(size: int, what: str, hint: str = "") -> None:
-    """Raises InputError when so many bytes do not fit into memory now; `what` will take them."""
+    """Raises InputError when the `size` bytes that `what` needs do not fit into memory now."""
     there = available()
     if size > there:
         raise InputError(
@@ -39,7 +39,7 @@ def require_memory(size: int, what: str, hint: str = "") -> None:
 
 
 def require_disk(size: int, folder: Path, what: str) -> None:
-    """Raises InputError when so many bytes do not fit on the disk of a folder."""
+    """Raises InputError when the `size` bytes that `what` needs do not fit on the disk of a folder."""
     there = shutil.disk_usage(folder).free
     if size > there:
         raise InputError(f"{folder}: {what} take up to {_shown(size)}: must be at most {_shown(there)}, which is free")

@@ -1,4 +1,4 @@
-"""An .npz that is written batch by batch, so that its arrays need not fit into memory."""
+"""Writes an .npz batch by batch, so that its arrays need not fit into memory."""
 
 import shutil
 import tempfile
@@ -14,20 +14,20 @@ from travjax.files import atomic_write
 from travjax.memory import require_disk
 
 SMALL = 1024
-"""Bytes an item up to which an array is held in memory; larger ones wait in a file without a name."""
+"""Largest size of an item, in bytes, of arrays that are kept in memory; others go to an unnamed file."""
 
 LEVEL = 1
-"""Of compression: flags shrink to a tenth at any, and numbers little at any."""
+"""Compression level: at any level flags shrink to a tenth, and numbers hardly at all."""
 
 
 class NpzStream:
-    """Arrays with a common leading axis that grow batch by batch, for an .npz; a context that gives up what it holds.
+    """Arrays with a common leading axis that grow batch by batch, for an .npz; a context that releases its files.
 
-    count: items that were added
+    count: number of items added
     """
 
     def __init__(self, path: Path, items: int, item_bytes: int, what: str):
-        """Raises InputError when so many items, whatever they are, do not fit on the disk twice: packed, and before."""
+        """Raises InputError unless `items` items fit on the disk twice, compressed and not."""
         require_disk(2 * items * item_bytes, path.parent, f"{items} {what}")
         self.path, self.count = path, 0
         self._files: dict[str, tuple[IO[bytes], np.dtype, tuple[int, ...]]] = {}
@@ -38,10 +38,10 @@ class NpzStream:
 
     def __exit__(self, *reason: object) -> None:
         for file, _, _ in self._files.values():
-            file.close()  # which has no name, and goes with that
+            file.close()  # it has no name, so closing removes it
 
     def append(self, batch: Mapping[str, np.ndarray]) -> None:
-        """Adds a batch of arrays [n, ...]; every batch holds the same ones. Raises InputError when the disk is full."""
+        """Adds a batch of arrays [n, ...]; every batch has the same names. Raises InputError when the disk is full."""
         try:
             for name, array in batch.items():
                 if array[:1].nbytes <= SMALL:
@@ -59,7 +59,7 @@ class NpzStream:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """What was added, by name; large arrays are mapped from their files."""
+        """The arrays added so far, by name; large ones are mapped from their files."""
         arrays = self._joined()
         for name, (file, dtype, shape) in self._files.items():
             file.flush()
@@ -67,7 +67,9 @@ class NpzStream:
         return arrays
 
     def save(self, without: Collection[str] = (), **more: np.ndarray | str | float) -> Path:
-        """Writes what was added, and arrays beside it, to the .npz, whole or not at all; `without` is left out."""
+        """Writes the added arrays and further ones to the .npz, whole or not at all; names in `without` are left
+        out.
+        """
         with (
             atomic_write(self.path) as temporary,
             zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=LEVEL) as archive,

@@ -1,4 +1,4 @@
-"""The options that commands and experiments share: groups of them, and the typed values that they stand for."""
+"""Options that commands and experiments share, in groups, and the typed values that they stand for."""
 
 import argparse
 from pathlib import Path
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # these take seconds to import
 
 
 class Commands(Protocol):
-    """What `add(commands)` of a command adds its parser to."""
+    """The object to which `add(commands)` of a command adds its parser."""
 
     def add_parser(self, name: str, *, help: str, description: str) -> argparse.ArgumentParser:
         """Returns a new parser for a command."""
@@ -35,7 +35,7 @@ class Options(Protocol):
 
 
 def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> None:
-    """Adds styles, number and seed of synthetic maps; see `maps`, `count` and `seed`."""
+    """Adds the options for styles, number and seed of synthetic maps; see `maps`, `count` and `seed`."""
     parser.add_argument(
         "--style",
         nargs="+",
@@ -50,7 +50,7 @@ def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> Non
 
 
 def add_world(parser: argparse.ArgumentParser) -> None:
-    """Adds the world of synthetic maps; see `MapStream`."""
+    """Adds the option for the world of synthetic maps; see `MapStream`."""
     parser.add_argument(
         "--world",
         type=float,
@@ -61,18 +61,18 @@ def add_world(parser: argparse.ArgumentParser) -> None:
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Adds robot and action space; see `setup`."""
+    """Adds the options for robot and action space; see `setup`."""
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
 
 
 GROWS = "features of synthetic maps grow with it, unless a world is given"
-"""What a map's edge does."""
+"""Help text on the effect of a map's size."""
 
 
 def add_grid(parser: Options) -> None:
-    """Adds size and spacing of maps; see `setup`."""
+    """Adds the options for size and spacing of maps; see `setup`."""
     parser.add_argument("--size", type=float, default=8.0, metavar="M", help=f"edge of a map in metres (8); {GROWS}")
     parser.add_argument(
         "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
@@ -80,11 +80,11 @@ def add_grid(parser: Options) -> None:
 
 
 RUN_OPTIONS = ("robot", "actions", "size", "spacing", "weights", "seed")
-"""What `add_run` adds."""
+"""Names of the options that `add_run` adds."""
 
 
 def add_run(parser: Options) -> None:
-    """Adds what of a run may differ from its preset; see `run_of`."""
+    """Adds the options that replace settings of a run's preset; see `run_of`."""
     parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     add_grid(parser)
@@ -100,11 +100,11 @@ DEM_OPTIONS = (
     *("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse"),
     *("band", "classes", "up", "gdal_driver"),
 )
-"""What `add_dem` adds; each is None or False where it is not given."""
+"""Names of the options that `add_dem` adds; each is None or False unless given."""
 
 
 def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
-    """Adds how elevation maps are read; see `windows`."""
+    """Adds the options for reading elevation maps; see `windows`."""
     parser.add_argument("--stride", type=float, metavar="M", help=f"metres between windows of a DEM ({stride:g})")
     parser.add_argument(
         "--cell-size", type=float, metavar="M", help="metres between a DEM's values, or into which points are put"
@@ -151,7 +151,7 @@ def _codes(text: str) -> tuple[int, ...]:
 
 
 def add_out(parser: argparse.ArgumentParser, folder: str) -> None:
-    """Adds the folder to write to."""
+    """Adds the option for the output folder."""
     parser.add_argument(
         "--out", type=user_path, default=Path(folder), metavar="DIR", help=f"folder to write to ({folder})"
     )
@@ -172,12 +172,12 @@ def seed(arguments: argparse.Namespace) -> int:
 
 
 def setup(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
-    """Returns grid, robot and action space; refuses what does not fit together before anything is made."""
+    """Returns grid, robot and action space; raises InputError early where they do not fit together."""
     return load_setup(arguments.robot, arguments.actions, arguments.size, arguments.spacing)
 
 
 def windows(arguments: argparse.Namespace) -> WindowOptions:
-    """Returns how elevation maps are read and cut into windows."""
+    """Returns the options for reading elevation maps and cutting them into windows."""
     reading = DemOptions(
         arguments.cell_size,
         arguments.height_scale,
@@ -192,7 +192,7 @@ def windows(arguments: argparse.Namespace) -> WindowOptions:
 
 
 def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:
-    """Returns the windows of elevation maps, or synthetic maps where no file is given; prints what they are."""
+    """Returns the windows of elevation maps, or synthetic maps if no file is given; prints a description of them."""
     unused = ("style", "count", "seed", "world") if arguments.dem else DEM_OPTIONS
     for name in unused:
         given = getattr(arguments, name)
@@ -207,7 +207,7 @@ def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:
 
 
 def run_of(preset: "Preset", arguments: argparse.Namespace) -> "Run":
-    """Returns the run of a preset with what RUN_OPTIONS let differ from it."""
+    """Returns the run of a preset with the settings that RUN_OPTIONS replace."""
     from travjax.training.fit import run_from_preset
 
     if arguments.seed is not None:

@@ -1,4 +1,4 @@
-"""Progress bars for those who watch, and lines that do not run into them."""
+"""Progress bars on terminals, and printed lines that do not disturb them."""
 
 import sys
 from typing import Any
@@ -10,7 +10,7 @@ from travjax.config import one_line
 Bar = tqdm
 
 LONGEST_PATH = 5000
-"""Characters, somewhat more than a system takes."""
+"""Most characters of a printed path, somewhat more than systems allow."""
 
 
 def bar(what: str, total: float | None, unit: str, quiet: bool = False, **options: Any) -> Bar:
@@ -20,7 +20,7 @@ def bar(what: str, total: float | None, unit: str, quiet: bool = False, **option
 
 
 def wrote(*paths: object) -> None:
-    """Prints where files were written, a line each whatever their names hold."""
+    """Prints where files were written, in one line each, whatever characters their names have."""
     for path in paths:
         print(one_line(path, LONGEST_PATH))
 

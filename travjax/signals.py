@@ -1,4 +1,4 @@
-"""What SIGINT and SIGTERM do to a program: one line, an exit code of 128 and the signal's number, and no remains."""
+"""How SIGINT and SIGTERM end a program: one line, an exit code of 128 plus the signal's number, and no remains."""
 
 import os
 import signal
@@ -9,22 +9,22 @@ from types import FrameType
 from typing import NoReturn
 
 ENDINGS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
-"""What the program says of each."""
+"""Word that the program prints for each signal."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, from a scheduler or a container: what cleans up after SIGINT does so after it as well."""
+    """Raised on SIGTERM, from a scheduler or a container, so that the same cleanup runs as after SIGINT."""
 
 
 def end_at_once() -> None:
-    """Lets a signal end the program where nothing is to be cleaned up: libraries swallow exceptions on import."""
+    """Lets a signal end the program at once while nothing needs cleanup: imports of libraries swallow exceptions."""
     for number in _heeded():
         signal.signal(number, _end)
 
 
 @contextmanager
 def raised() -> Iterator[None]:
-    """Lets SIGINT raise KeyboardInterrupt and SIGTERM its Terminated while the block runs."""
+    """Lets SIGINT raise KeyboardInterrupt and SIGTERM raise Terminated while the block runs."""
     before = {number: signal.signal(number, _raise) for number in _heeded()}
     try:
         yield
@@ -35,7 +35,7 @@ def raised() -> Iterator[None]:
 
 @contextmanager
 def going_on(how: str) -> Iterator[None]:
-    """Lets a program that is stopped in the block say how it goes on."""
+    """Lets a program that is stopped within the block tell how to resume it."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -44,13 +44,13 @@ def going_on(how: str) -> Iterator[None]:
 
 
 def ending(error: KeyboardInterrupt) -> tuple[int, str]:
-    """Returns the exit code of a program that a signal ended, and its line: the error's notes say how to go on."""
+    """Returns the exit code of a program that a signal ended, and its line; the error's notes tell how to resume."""
     number = signal.SIGTERM if isinstance(error, Terminated) else signal.SIGINT
     return 128 + number, "; ".join([ENDINGS[number], *getattr(error, "__notes__", [])])
 
 
 def _heeded() -> list[signal.Signals]:
-    """Returns the signals that whoever started the program has not set to be ignored, as nohup and a shell's & do."""
+    """Returns the signals that are not set to be ignored, as nohup and a shell's & do when they start a program."""
     if threading.current_thread() is not threading.main_thread():
         return []
     return [number for number in ENDINGS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
