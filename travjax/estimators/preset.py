@@ -20,7 +20,7 @@ SCHEDULES = ("constant", "cosine")
 OPTIMIZERS = ("rmsprop", "adamw")
 
 IMAGENET_WEIGHTS = "imagenet/resnet50_imagenet.npz"
-"""The default ImageNet weights: where this file does not exist, equivalent ones are fetched."""
+"""The default ImageNet weights: where this file does not exist, others are fetched."""
 
 MOST = 2**31 - 1
 """Largest value of any count, and of a seed."""

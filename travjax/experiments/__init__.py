@@ -1,4 +1,8 @@
-"""The experiments, a program each: `python -m travjax.experiments.NAME`; experiments/NAME holds recorded results."""
+"""The experiments, one program each: `python -m travjax.experiments.NAME`; experiments/NAME holds recorded results.
+
+In: presets, sites, trained runs. Out: a report with tables, figures and all numbers as JSON, in a folder.
+Stands on training/, runs/, evaluation/ and all that these stand on.
+"""
 
 import sys
 
