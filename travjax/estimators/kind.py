@@ -38,7 +38,7 @@ class Batch(NamedTuple):
     weight: Float[np.ndarray, " b"] | Float[Array, " b"]
 
 
-class TrajectorySamples(Protocol):
+class TrainingData(Protocol):
     """The samples that a run is trained and validated on, on the host."""
 
     dataset: Dataset
@@ -135,7 +135,7 @@ class EstimatorKind(Protocol):
     ) -> PyTree:
         """Returns the arrays to put on the devices for maps, NaN unknown; on_progress: is told of trajectories."""
 
-    def data(self, preset: Preset, dataset: Dataset) -> TrajectorySamples:
+    def data(self, preset: Preset, dataset: Dataset) -> TrainingData:
         """Returns the samples of a data set that are trained and validated on.
 
         Raises InputError when there are no training or no validation samples.
