@@ -31,14 +31,14 @@ from travjax.config import (
 )
 from travjax.data.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, read_table
 from travjax.data.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
-from travjax.data.sampling import random_keys
+from travjax.data.sampling import Samples, random_keys
 from travjax.files import atomic_write_folder, put_back, sha256, user_path
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import label_codes
 from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, packed, simulate
+from travjax.simulation.traverse import failures, packed, simulate, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain, require_world
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
@@ -192,6 +192,10 @@ class Dataset:
         """Returns the indices of the maps of "train", "validation" or "test": [k]."""
         require(split in SPLITS, "split", split, f"one of {', '.join(SPLITS)}")
         return np.flatnonzero(self.split == SPLITS.index(split))
+
+    def failed(self, samples: Samples) -> np.ndarray:
+        """Returns the failures of samples: [k, events] bool."""
+        return np.asarray(unpacked(self.labels[samples], self.robot)[0])
 
 
 def generate(

@@ -29,7 +29,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import views_of
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import simulate, unpacked
+from travjax.simulation.traverse import simulate
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["heights", "stencil", "elevation_scale"], meta_fields=[])
@@ -87,7 +87,7 @@ class MapSamples:
 
     def failed(self, samples: Samples) -> np.ndarray:
         """Returns the failures of samples: [k, events] float32."""
-        return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
+        return self.dataset.failed(samples).astype(np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
         """Returns the number of maps of an epoch."""

@@ -11,7 +11,6 @@ from travjax.data.dataset import Dataset
 from travjax.data.sampling import Sampler, Samples, balanced_subset, batches, random_keys
 from travjax.estimators.kind import Batch
 from travjax.estimators.preset import TrainingConfig
-from travjax.simulation.traverse import unpacked
 
 
 class TrajectorySamples:
@@ -50,7 +49,7 @@ class TrajectorySamples:
 
     def failed(self, samples: Samples) -> np.ndarray:
         """Returns the failures of samples: [k, events] float32."""
-        return np.asarray(unpacked(self.dataset.labels[samples], self.dataset.robot)[0], np.float32)
+        return self.dataset.failed(samples).astype(np.float32)
 
     def count(self, phase: int, epoch: int) -> int:
         """Returns the number of samples of an epoch."""

@@ -63,7 +63,7 @@ class Evaluator:
 
     def failed(self, samples: Samples) -> np.ndarray:
         """Returns the failures of samples: [k, events] bool."""
-        return np.asarray(unpacked(self.dataset.labels[samples], self.run.robot)[0])
+        return self.dataset.failed(samples)
 
     def probabilities(
         self, estimator: Network, samples: Samples, on_progress: Progress = lambda count: None

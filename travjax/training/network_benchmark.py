@@ -99,7 +99,7 @@ class Bench:
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}
         state = self.devices.replicate(state)
         maps, trajectories = (index[:STEP_BATCH] for index in self.sampler.epoch(0))
-        failed = np.asarray(unpacked(self.dataset.labels[maps, trajectories], self.dataset.robot)[0], np.float32)
+        failed = self.dataset.failed((maps, trajectories)).astype(np.float32)
         inputs = phase.place(self.source, (maps, trajectories), self.devices)
         batch = Batch(inputs, *self.devices.shard((failed, np.ones(STEP_BATCH, np.float32))))
 
