@@ -279,9 +279,8 @@ def cache_folder() -> Path | None:
     """Returns the user's cache folder for files that can be made again, or None for a user without a home."""
     home = os.path.expanduser("~") if os.environ.get("HOME") != "" else ""
     given = os.environ.get("XDG_CACHE_HOME", "")
-    place = (
-        given if os.path.isabs(given) else os.path.join(home, ".cache")
-    )  # the XDG standard says to ignore relative paths
+    # The XDG standard says to ignore relative paths.
+    place = given if os.path.isabs(given) else os.path.join(home, ".cache")
     return Path(place) / "travjax" if os.path.isabs(place) else None
 
 

@@ -35,7 +35,6 @@ def main() -> int:
         "--out", type=Path, default=Path("runs/fuzz"), metavar="DIR", help="where files of failing cases go (runs/fuzz)"
     )
     given = parser.parse_args()
-    sys.path.insert(0, str(campaign.REPOSITORY))
     known = list(importlib.import_module(campaign.FORMATS).FORMATS)
     pairs = [(name, int(seed)) for name, _, seed in (case.rpartition(":") for case in given.case or ())]
     names = list(dict.fromkeys(name for name, _ in pairs)) if pairs else given.formats or known

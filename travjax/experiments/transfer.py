@@ -107,9 +107,8 @@ def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
     base = _base(path.parent / user_path(config.synthetic), arguments)
     synthetic = arguments.synthetic or out / "synthetic"
     data = _data(sites, arguments.data, base, out, stand_ins)
-    transfer = Transfer(
-        config, base, synthetic, data, out, devices
-    )  # raises where something does not fit, before hours of work
+    # Before hours of work, as it raises where something does not fit.
+    transfer = Transfer(config, base, synthetic, data, out, devices)
     if not arguments.synthetic:
         _train_synthetic(base, synthetic, devices)
     say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")

@@ -16,11 +16,9 @@ from travjax.evaluation import map_figures, score_figures, tables
 from travjax.evaluation.metrics import RECALLS, Evaluation, json_ready
 from travjax.files import output_folder, save_text, user_path
 from travjax.jax_flags import usual_flags
-from travjax.models.hazard_field import LARGE_MARGIN
 from travjax.models.variables import Network
 from travjax.runs.evaluator import Evaluator
-from travjax.runs.run import DATA, load_estimator
-from travjax.simulation.robot import Robot
+from travjax.runs.run import DATA, Run, load_estimator
 from travjax.simulation.traverse import unpacked
 
 MARGINS = "regressed margins above their limits"
@@ -128,7 +126,7 @@ def _write_tables(
     ]
     if errors is not None:
         of_margins = tables.metrics_table(others[MARGINS], paper)
-        parts += [f"{MARGINS.capitalize()}:\n{of_margins}", _margin_errors(errors, evaluator.run.robot)]
+        parts += [f"{MARGINS.capitalize()}:\n{of_margins}", _margin_errors(errors, evaluator.run)]
     text = "\n\n".join(parts)
     progress.say(f"\n{text}\n")
     results = {"sample": description, "network": json_ready(scores)}
@@ -139,10 +137,11 @@ def _write_tables(
         progress.wrote(save_text(out / name, content + "\n"))
 
 
-def _margin_errors(errors: np.ndarray, robot: Robot) -> str:
-    """Returns one line with the mean absolute errors [k] of the margins of a robot's events."""
-    each = ", ".join(f"{event.name} {event.shown(error)}" for event, error in zip(robot.events, errors, strict=True))
-    return f"Mean absolute error of the margins, those above {LARGE_MARGIN:g} limits counted as that: {each}"
+def _margin_errors(errors: np.ndarray, run: Run) -> str:
+    """Returns one line with the mean absolute errors [k] of the margins of the robot's events."""
+    pairs, largest = zip(run.robot.events, errors, strict=True), run.kind.largest_margin
+    each = ", ".join(f"{event.name} {event.shown(error)}" for event, error in pairs)
+    return f"Mean absolute error of the margins, those above {largest:g} limits counted as that: {each}"
 
 
 def _draw(

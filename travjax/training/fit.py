@@ -101,7 +101,7 @@ def _fit(wanted: Run, folder: Path, devices: Devices, data: str | Path | None, r
             progress.wrote(_draw_inputs(trainer, folder))
     trainer.train()
     if devices.main:
-        _finish(folder)
+        _finish(folder, wanted)
 
 
 def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
@@ -146,9 +146,9 @@ def _draw_inputs(trainer: Trainer, folder: Path) -> Path:
     )
 
 
-def _finish(folder: Path) -> None:
+def _finish(folder: Path, run: Run) -> None:
     """Draws the training figure of the run, and prints where everything was written."""
-    rows, events = folder / "metrics.jsonl", Run.load(folder).robot.event_names
+    rows, events = folder / "metrics.jsonl", run.robot.event_names
     progress.say("")
     for path in (folder / "checkpoints", rows, folder / "tensorboard"):
         progress.wrote(path)
