@@ -88,6 +88,7 @@ class Layout:
 class NodeTable:
     """Nodes and pose constants of first arcs and their second arcs; node = row * cols + col.
 
+    poses:   [F, P, 3] x, y in metres and heading in radians, in the view
     wheels:  [F, P, 4, V] int32 node under the wheels FL, FR, RL, RR, on the original map
     centre:  [F, P] int32 node nearest to the robot's centre, in the view
     offset:  [F, P, 2] float32 vector from that node to the robot's centre, (x, y) in cells
@@ -97,6 +98,7 @@ class NodeTable:
     source:  [T] int32 index of every trajectory in the flattened results [F, R, V]
     """
 
+    poses: np.ndarray
     wheels: np.ndarray
     centre: np.ndarray
     offset: np.ndarray
@@ -129,6 +131,7 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     chassis = np.stack([row - centre[:, :1], start - centre[:, 1:], count], axis=1).astype(np.int16)
     by_arc = lambda array: np.ascontiguousarray(array).reshape(*poses.shape[:2], *array.shape[1:])
     return NodeTable(
+        poses=poses,
         wheels=_wheel_nodes(actions, views, turn, first, robot, grid),
         centre=by_arc(centre[:, 0] * grid.nodes + centre[:, 1]),
         offset=by_arc((flat[:, :2] / grid.spacing + grid.cells / 2 - centre[:, ::-1]).astype(np.float32)),

@@ -9,6 +9,9 @@ from travjax.simulation.events import OPTIONAL, PAPER, Event
 
 PRESETS = Path(__file__).parent / "robots"
 
+CONTACTS = ("nearest", "tyre")
+"""The contact models: how wheels and body touch the ground (SPEC sections 5 and 15)."""
+
 LONGEST_NAME = 100
 """Characters that a robot's name may have at most."""
 
@@ -22,13 +25,18 @@ class Robot:
     track:          left to right wheel centres; the wheels must not be inside the chassis
     wheel_diameter, wheel_width
     chassis_length, chassis_width: the body that can hit the ground, centred between the wheels
-    overall_length, overall_width: outer dimensions, for pictures
+    overall_length, overall_width: outer dimensions: the outline of the contact model `tyre`, and for pictures
     ride_height:    ground clearance under the chassis: the limit of the obstacle margin
     max_step:       limit of the step margin
     max_tilt:       limit of the tilt margin, radians
     max_roll:       limit of the roll margin, the largest sideways slope of the pose plane as an angle, radians. Without
                     it, as in the paper, a robot has no roll event; with it, roll is a fourth event of labels, tables,
                     figures and estimators
+    overhang_height: ground clearance under what lies beyond the chassis in the overall outline; the ride height unless
+                    given. This and the next are for the contact model `tyre` (SPEC section 15)
+    nose_rise:      how much higher than at the axles the underside is, or gives way, at the front and rear ends; none
+                    unless given
+    contact:        contact model of this robot, "nearest" or "tyre", where no command or argument says otherwise
 
     Raises InputError (a ValueError) that names field, value and what is allowed.
     """
@@ -46,13 +54,18 @@ class Robot:
     max_step: float
     max_tilt: float = field(metadata={"angle": True})
     max_roll: float | None = field(default=None, metadata={"angle": True, "optional": True})
+    overhang_height: float | None = field(default=None, metadata={"optional": True})
+    nose_rise: float | None = field(default=None, metadata={"optional": True})
+    contact: str | None = field(default=None, compare=False, metadata={"optional": True})
 
     def __post_init__(self):
         named = isinstance(self.name, str) and 0 < len(self.name) <= LONGEST_NAME and self.name.isprintable()
         require(named, "name", self.name, f"a non-empty text of one line, at most {LONGEST_NAME} characters")
+        chosen = (None, *CONTACTS)
+        require(self.contact in chosen, "contact", self.contact, " or ".join(map(repr, CONTACTS)))
         for one in fields(self)[1:]:
             value = getattr(self, one.name)
-            if value is None and "optional" in one.metadata:
+            if one.name == "contact" or (value is None and "optional" in one.metadata):
                 continue
             if "angle" in one.metadata:
                 allowed = "an angle from 0.01 to 90 degrees (pi/2 rad)"

@@ -1,0 +1,187 @@
+"""The `nearest` contact model, the paper's: a wheel touches the node nearest to its centre (SPEC section 5).
+
+heights -> the four wheel contacts and the pose plane at each pose -> largest step, obstacle and tilt of each arc ->
+margins of all trajectories. A few first arcs are simulated at a time, so that their poses stay in the cache.
+BUILD_NOTES.md has the measurements behind this layout; arcs.py explains lanes, footprint.py the letters in shapes.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache, partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from travjax.batching import rounded
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.arcs import (
+    UNKNOWN_HEIGHT,
+    Poses,
+    above_centre,
+    arc_maxima,
+    by_trajectory,
+    margins_of,
+    node_lanes,
+    view_lanes,
+)
+from travjax.simulation.events import PAPER, Event, Margins, larger
+from travjax.simulation.footprint import RUN, Layout, chassis_places, node_table
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+
+FEW_MAPS = 2
+"""For up to this many maps, RUN neighbouring nodes are read at once: the lanes alone do not fill a vector register."""
+
+POSES_AT_ONCE = 200_000
+"""Poses times lanes that a CPU simulates at once: a float32 array of them fits in the second-level cache of a core."""
+
+NODES_AT_ONCE = 8
+"""Chassis places read in one step of the scan: enough to save memory traffic, few enough to stay in registers."""
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["wheels", "centre", "offset", "axes", "runs", "singles"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class _Chunks:
+    """The pose arrays of a NodeTable cut into chunks, laid out in the order in which they are read.
+
+    wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], where steps
+    are those of the kernel's scan
+    """
+
+    wheels: jax.Array
+    centre: jax.Array
+    offset: jax.Array
+    axes: jax.Array
+    runs: jax.Array
+    singles: jax.Array
+
+
+def nearest_margins(maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid) -> Margins:
+    """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
+    chunks, source = _device_tables(robot, actions, grid, len(maps))
+    layout = node_table(robot, actions, grid).layout
+    return _simulate(maps, chunks, source, robot.wheelbase, robot.track, layout, robot.events)
+
+
+@lru_cache(maxsize=8)
+def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
+    """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device."""
+    table = node_table(robot, actions, grid)
+    runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
+    arcs = len(table.centre)
+    if jax.default_backend() == "cpu":
+        arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
+    padding = -len(table.centre) % arcs
+
+    def cut(array):
+        array = np.concatenate([array, array[:1].repeat(padding, axis=0)])
+        return array.reshape(len(array) // arcs, arcs * array.shape[1], *array.shape[2:])
+
+    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
+        chunks = _Chunks(
+            wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
+            centre=jnp.asarray(cut(table.centre)),
+            offset=jnp.asarray(cut(table.offset)),
+            axes=jnp.asarray(cut(table.axes)),
+            runs=jnp.asarray(_scan_order(cut(runs))),
+            singles=jnp.asarray(_scan_order(cut(singles))),
+        )
+        return chunks, jnp.asarray(table.source)
+
+
+def _scan_order(places: np.ndarray) -> np.ndarray:
+    """Reorders [C, A P, 2, K] to [C, steps, A P, 2, places], with about NODES_AT_ONCE places in a step."""
+    chunks, poses, _, count = places.shape
+    steps = -(-count // NODES_AT_ONCE)
+    places = np.concatenate([places, places[..., :1].repeat(-count % max(steps, 1), axis=-1)], axis=-1)
+    each = places.shape[-1] // max(steps, 1)
+    return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
+
+
+@partial(jax.jit, static_argnames=("layout", "events"))
+def _simulate(
+    maps, chunks: _Chunks, source, wheelbase, track, layout: Layout, events: tuple[Event, ...] = PAPER
+) -> Margins:
+    grid = layout.grid
+    by_node = node_lanes(above_centre(maps, grid))
+    views = view_lanes(by_node, layout)
+
+    def simulate_chunk(chunk: _Chunks) -> jax.Array:
+        contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
+        plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
+        clearance = _highest_above(views, plane, chunk, grid.nodes)
+        poses = Poses(contact, None, plane.pitch, plane.roll, plane.steepness, clearance)
+        return arc_maxima(poses, layout, events)
+
+    return margins_of(by_trajectory(jax.lax.map(simulate_chunk, chunks), source, len(maps)), events)
+
+
+def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
+    """Gathers the contact heights of the wheels: [4, A P, lanes]."""
+    heights = by_node.at[wheels].get(mode="promise_in_bounds")
+    return heights.reshape(*heights.shape[:2], -1)
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """Pose planes: height = level + east * columns + north * rows from the node `centre`; [A P, lanes] each.
+
+    pitch, roll, steepness: as in events.Pose
+    """
+
+    level: jax.Array
+    east: jax.Array
+    north: jax.Array
+    pitch: jax.Array
+    roll: jax.Array
+    steepness: jax.Array
+
+
+def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
+    """Fits the least-squares planes to the four contacts.
+
+    Each sum includes at most one unrounded product, so that a map gives the same bits in any batch, however the loop is
+    compiled.
+    """
+    front_left, front_right, rear_left, rear_right = contact
+    pitch = ((front_left + front_right) - (rear_left + rear_right)) * (0.5 / wheelbase)
+    roll = ((front_right + rear_right) - (front_left + rear_left)) * (0.5 / track)
+    cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
+    east = (roll * cos - rounded(pitch * sin)) * spacing
+    north = (roll * sin + rounded(pitch * cos)) * spacing
+    steepness = pitch * pitch + rounded(roll * roll)
+    east, north, steepness = jax.lax.optimization_barrier((east, north, steepness))
+    middle = (front_left + front_right + rear_left + rear_right) / 4
+    level = middle - rounded(east * chunk.offset[:, :1]) - north * chunk.offset[:, 1:]
+    return _Planes(jax.lax.optimization_barrier(level), east, north, pitch, roll, steepness)
+
+
+def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
+    """Returns the largest height of a chassis node above the pose plane: [A P, lanes]."""
+    highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
+    if not len(chunk.runs):
+        return highest
+    in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, RUN, cols)
+    return reduce(larger, jnp.split(in_runs, RUN, axis=1), highest)
+
+
+def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
+    """Returns the largest height above the pose plane over all places, for each of `run` nodes: [A P, run * lanes]."""
+    nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
+    aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
+    level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
+
+    def step(highest, group):
+        for k in range(group.shape[-1]):
+            row, col = group[:, 0, k], group[:, 1, k]
+            height = nodes.at[centre + row.astype(jnp.int32) * cols + col].get(mode="promise_in_bounds")
+            columns = col.astype(jnp.float32)[:, None] + aside
+            above = height - (level + east * columns + north * row.astype(jnp.float32)[:, None])
+            highest = larger(above, highest)
+        return highest, None
+
+    return jax.lax.scan(step, jnp.full_like(level, -UNKNOWN_HEIGHT), places)[0]

@@ -1,0 +1,288 @@
+"""The `tyre` contact model: wheels with radius and width, and the whole outline (SPEC section 15).
+
+heights and steps of a map, and the table of some poses (tyre_tables.py) -> the pose plane on the resting heights of the
+four wheels, the step and the clearance at each pose. traverse.py makes the margins of trajectories of them, as it does
+for the paper's contact model; the letters in shapes are explained in footprint.py. N is the number of poses.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from travjax.batching import rounded
+from travjax.simulation.actions import ActionSpace
+from travjax.simulation.arcs import (
+    UNKNOWN_HEIGHT,
+    Poses,
+    above_centre,
+    arc_maxima,
+    by_trajectory,
+    margins_of,
+    node_lanes,
+    pose_maxima,
+    view_lanes,
+)
+from travjax.simulation.events import Margins, Pose, larger
+from travjax.simulation.footprint import Layout, node_table
+from travjax.simulation.grid import Grid
+from travjax.simulation.robot import Robot
+from travjax.simulation.steps import step_heights
+from travjax.simulation.tyre_tables import Places, TyreTable, tyre_table
+
+ROUNDS = 2
+"""How often wheels are put on the ground: slopes follow from resting heights, and resting heights from slopes."""
+
+POSES_AT_ONCE = 50_000
+"""Poses times lanes that a CPU simulates at once; BUILD_NOTES.md has the measurement."""
+
+TURN_STEP = math.radians(5)
+"""Largest angle between poses of a point turn."""
+
+NODES_AT_ONCE = 8
+"""Nodes of a tyre or an outline that are read in one step of a scan."""
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["row", "col", "height"], meta_fields=[])
+@dataclass(frozen=True)
+class _Scan:
+    """Places in the order of a scan: [..., steps, N, places]."""
+
+    row: jax.Array
+    col: jax.Array
+    height: jax.Array
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["centre", "offset", "axes", "corner", "within", "tyres", "outline"],
+    meta_fields=[],
+)
+@dataclass(frozen=True)
+class TyreChunks:
+    """A TyreTable on the device, cut into chunks of poses: [C, ...] each."""
+
+    centre: jax.Array
+    offset: jax.Array
+    axes: jax.Array
+    corner: jax.Array
+    within: jax.Array
+    tyres: _Scan
+    outline: _Scan
+
+
+def tyre_chunks(table: TyreTable, chunks: int) -> TyreChunks:
+    """Cuts a table into chunks of equally many poses, and puts it on the device; N must be a multiple of `chunks`."""
+
+    def cut(array: np.ndarray) -> jax.Array:
+        return jnp.asarray(array.reshape(chunks, -1, *array.shape[1:]))
+
+    def scan(places: Places) -> _Scan:
+        return _Scan(
+            *(jnp.asarray(_scan_order(array.reshape(chunks, -1, array.shape[1]))) for array in vars(places).values())
+        )
+
+    names = ("centre", "offset", "axes", "corner", "within")
+    return TyreChunks(*(cut(getattr(table, name)) for name in names), scan(table.tyres), scan(table.outline))
+
+
+def _scan_order(array: np.ndarray) -> np.ndarray:
+    """Reorders [C, N, K] to [C, steps, N, places], with about NODES_AT_ONCE places in a step."""
+    chunks, poses, count = array.shape
+    steps = -(-count // NODES_AT_ONCE)
+    each = -(-count // steps)
+    array = np.pad(array, ((0, 0), (0, 0), (0, steps * each - count)), mode="edge")
+    return array.reshape(chunks, poses, steps, each).transpose(0, 2, 1, 3)
+
+
+def tyre_margins(maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, turn: bool = True) -> Margins:
+    """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
+    layout = node_table(robot, actions, grid).layout
+    chunks, source = _arc_chunks(robot, actions, grid, len(maps))
+    turns = _turns(robot, actions, grid) if turn else None
+    return _simulate(maps, chunks, source, turns, robot, layout)
+
+
+@lru_cache(maxsize=8)
+def _arc_chunks(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[TyreChunks, jax.Array]:
+    """Puts the tables of all arcs for batches of `maps` maps, and the `source` of trajectories, on the device."""
+    table = node_table(robot, actions, grid)
+    arcs = table.poses.shape[0]
+    if jax.default_backend() == "cpu":
+        arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
+    padding = table.poses[:1].repeat(-len(table.poses) % arcs, axis=0)
+    poses = np.concatenate([table.poses, padding])
+    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
+        chunks = tyre_chunks(tyre_table(poses.reshape(-1, 3), robot, grid), len(poses) // arcs)
+        return chunks, jnp.asarray(table.source)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["chunk", "passed", "turn"], meta_fields=[])
+@dataclass(frozen=True)
+class _Turns:
+    """The poses of all point turns, which lie around the circle, in one chunk.
+
+    passed: [turns, N] which poses each turn passes through; turn: [t] the turn of each trajectory
+    """
+
+    chunk: TyreChunks
+    passed: Bool[Array, "turns N"]
+    turn: jax.Array
+
+
+@lru_cache(maxsize=8)
+def _turns(robot: Robot, actions: ActionSpace, grid: Grid) -> _Turns:
+    """Puts the tables of the point turns on the device."""
+    headings, passed = turn_poses(actions)
+    poses = np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=-1)
+    with jax.ensure_compile_time_eval():
+        chunk = jax.tree.map(lambda array: array[0], tyre_chunks(tyre_table(poses, robot, grid), 1))
+        turn = actions.split(np.arange(len(actions)))[0]
+        return _Turns(chunk, jnp.asarray(passed), jnp.asarray(turn))
+
+
+def turn_poses(actions: ActionSpace) -> tuple[np.ndarray, np.ndarray]:
+    """Computes the headings of the poses of all point turns [N], and which of them each turn passes: [turns, N].
+
+    A turn goes the shorter way round, the half circle anticlockwise.
+    """
+    parts = math.ceil(2 * math.pi / actions.turns / TURN_STEP - 1e-9)
+    place, end = np.arange(actions.turns * parts), np.arange(actions.turns)[:, None] * parts
+    anticlockwise = 2 * end <= len(place)
+    passed = np.where(anticlockwise, place <= end, (place >= end) | (place == 0))
+    return 2 * math.pi * place / len(place), passed
+
+
+@partial(jax.jit, static_argnames=("robot", "layout"))
+def _simulate(maps, chunks: TyreChunks, source, turns: _Turns | None, robot: Robot, layout: Layout) -> Margins:
+    grid, events = layout.grid, robot.events
+    heights = above_centre(maps, grid)
+    by_node, by_node_steps = (
+        node_lanes(heights),
+        node_lanes(step_heights(heights, robot.wheel_diameter / 2, grid.spacing)),
+    )
+    views, view_steps = view_lanes(by_node, layout), view_lanes(by_node_steps, layout)
+
+    def simulate_chunk(chunk: TyreChunks) -> jax.Array:
+        return arc_maxima(settle(views, view_steps, chunk, robot, grid), layout, events)
+
+    maxima = by_trajectory(jax.lax.map(simulate_chunk, chunks), source, len(maps))
+    if turns is not None:
+        poses = settle(by_node, by_node_steps, turns.chunk, robot, grid)
+        pose = Pose(poses.contact, (poses.step,), poses.pitch, poses.roll, poses.steepness, poses.clearance)
+        at_pose = pose_maxima([pose], events)  # [E + 1, N, n]
+        passed = jnp.where(turns.passed[..., None], at_pose[:, None], -UNKNOWN_HEIGHT)
+        maxima = larger(passed.max(axis=2)[:, turns.turn].transpose(0, 2, 1), maxima)
+    return margins_of(maxima, events)
+
+
+def settle(
+    heights: Float[Array, "nodes lanes"],
+    steps: Float[Array, "nodes lanes"],
+    chunk: TyreChunks,
+    robot: Robot,
+    grid: Grid,
+) -> Poses:
+    """Puts the robot on the ground at the poses of one chunk; contacts are the wheels' resting heights.
+
+    heights: metres above the map's centre, UNKNOWN_HEIGHT where unknown; steps: metres, of steps.step_heights
+    """
+    cols, spacing, wheelbase, track = grid.nodes, grid.spacing, robot.wheelbase, robot.track
+    right, forward = (jnp.array(signs)[None, :, None] for signs in ([-1, 1, -1, 1], [1, 1, -1, -1]))
+    cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
+
+    def slopes(wheels: jax.Array) -> tuple[jax.Array, jax.Array]:
+        front_left, front_right, rear_left, rear_right = (wheels[:, wheel] for wheel in range(4))
+        pitch = ((front_left + front_right) - (rear_left + rear_right)) * (0.5 / wheelbase)
+        roll = ((front_right + rear_right) - (front_left + rear_left)) * (0.5 / track)
+        return pitch, roll
+
+    def a_cell(pitch: jax.Array, roll: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the rise of the pose plane from a node to the next, east and north."""
+        east = (roll * cos - rounded(pitch * sin)) * spacing
+        north = (roll * sin + rounded(pitch * cos)) * spacing
+        return jax.lax.optimization_barrier((east, north))
+
+    def at_centre(east: jax.Array, north: jax.Array) -> jax.Array:
+        """Returns how much higher the plane is at the robot's centre than at the node nearest to it."""
+        return rounded(east * chunk.offset[:, :1]) + rounded(north * chunk.offset[:, 1:])
+
+    start, highest = _under_wheels(heights, chunk, cols)
+    pitch, roll = (jnp.where(highest < UNKNOWN_HEIGHT / 2, slope, 0) for slope in slopes(start))
+    for round_ in range(ROUNDS):
+        east, north = a_cell(pitch, roll)
+        above, step = _on_tyres(heights, steps if round_ == ROUNDS - 1 else None, east, north, chunk, cols)
+        highest = larger(highest, above.max(axis=1))
+        # A plane with the slopes so far lies at `above` under each wheel: their differences are what the slopes lack.
+        plane = at_centre(east, north)[:, None] + rounded(pitch[:, None] * forward * (wheelbase / 2))
+        rest = above + plane + rounded(roll[:, None] * right * (track / 2))
+        more = slopes(above)
+        pitch, roll = (
+            jnp.where(highest < UNKNOWN_HEIGHT / 2, slope + lacking, 0)
+            for slope, lacking in zip((pitch, roll), more, strict=True)
+        )
+    middle = (rest[:, 0] + rest[:, 1] + rest[:, 2] + rest[:, 3]) / 4
+    east, north = a_cell(pitch, roll)
+    level = jax.lax.optimization_barrier(middle - at_centre(east, north))
+    clearance = _clearance(heights, level, east, north, chunk, cols)
+    contact = [jnp.where(highest < UNKNOWN_HEIGHT / 2, rest[:, wheel], UNKNOWN_HEIGHT) for wheel in range(4)]
+    return Poses(contact, step, pitch, roll, pitch * pitch + rounded(roll * roll), clearance)
+
+
+def _under_wheels(heights: jax.Array, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
+    """Returns the ground under the wheels' centres, bilinear between nodes [N, 4, lanes], and its highest node."""
+    x, y = chunk.within[..., :1], chunk.within[..., 1:]
+    weights = ((1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y)
+    nodes = [_read(heights, chunk.corner + offset) for offset in (0, 1, cols, cols + 1)]
+    ground = sum(rounded(node * weight) for node, weight in zip(nodes, weights, strict=True))
+    highest = nodes[0]
+    for node in nodes[1:]:
+        highest = larger(highest, node)
+    return jax.lax.optimization_barrier((ground, highest.max(axis=1)))
+
+
+def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
+    """Returns the height at which a plane through each pose's central node touches the tyres [N, 4, lanes], and the
+    largest step that they reach [N, lanes]; no step where `steps` is None.
+    """
+    centre = jnp.repeat(chunk.centre, 4)
+    east, north = (jnp.repeat(slope, 4, axis=0) for slope in (east, north))
+
+    def scan(largest, places: _Scan):
+        above, reached = largest
+        for k in range(places.row.shape[-1]):
+            row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
+            node, drop = centre + row * cols + col, places.height[:, k, None]
+            plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
+            above = larger(_read(heights, node) - plane - drop, above)
+            if steps is not None:
+                step = _read(steps, node)
+                reached = larger(jnp.where(step >= drop, step, 0), reached)
+        return (above, reached), None
+
+    first = jnp.full_like(east, -UNKNOWN_HEIGHT), jnp.zeros_like(east)
+    above, reached = jax.lax.scan(scan, first, chunk.tyres)[0]
+    by_wheel = above.reshape(-1, 4, above.shape[-1]), reached.reshape(-1, 4, above.shape[-1]).max(axis=1)
+    return jax.lax.optimization_barrier(by_wheel)
+
+
+def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int) -> jax.Array:
+    """Returns the largest height of a node of the outline above the pose plane and what is allowed there."""
+
+    def scan(highest, places: _Scan):
+        for k in range(places.row.shape[-1]):
+            row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
+            plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
+            height = _read(heights, chunk.centre + row * cols + col)
+            highest = larger(height - (level + plane) - places.height[:, k, None], highest)
+        return highest, None
+
+    return jax.lax.scan(scan, jnp.full_like(level, -UNKNOWN_HEIGHT), chunk.outline)[0]
+
+
+def _read(lanes: jax.Array, nodes: jax.Array) -> jax.Array:
+    return lanes.at[nodes].get(mode="promise_in_bounds")
