@@ -90,7 +90,7 @@ def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: flo
 
     Raises ValueError if the map has no centre node, or if the circle around wheels and chassis leaves the map.
     """
-    heights = _above_centre(heights)
+    heights = above_centre(heights)
     path = poses(actions, trajectory)
     _check_on_map(heights, robot, path, cell_size)
 
@@ -110,8 +110,11 @@ def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: flo
     return TrajectoryMargins(step, obstacle, tilt, known=True)
 
 
-def _above_centre(heights) -> np.ndarray:
-    """Returns float64 heights relative to the centre node, or to some known node if the centre is unknown."""
+def above_centre(heights) -> np.ndarray:
+    """Returns float64 heights [rows, cols] relative to the centre node, or to some known node if the centre is unknown.
+
+    Raises ValueError if the map has no centre node.
+    """
     heights = np.asarray(heights, dtype=np.float64)
     if heights.ndim != 2 or heights.shape[0] % 2 == 0 or heights.shape[1] % 2 == 0:
         raise ValueError(f"heights has shape {heights.shape}, allowed is [rows, cols], both odd")
@@ -166,8 +169,8 @@ def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: flo
     """Returns the largest height of a node under the chassis above the pose plane; NaN if one of them is unknown."""
     sin, cos = math.sin(heading), math.cos(heading)
     radius = _circumradius(robot)
-    rows = _window(y, radius, heights.shape[0], cell_size)
-    cols = _window(x, radius, heights.shape[1], cell_size)
+    rows = window(y, radius, heights.shape[0], cell_size)
+    cols = window(x, radius, heights.shape[1], cell_size)
     east = (np.arange(cols.start, cols.stop) - heights.shape[1] // 2) * cell_size - x
     north = ((np.arange(rows.start, rows.stop) - heights.shape[0] // 2) * cell_size - y)[:, None]
     u = east * cos + north * sin
@@ -179,7 +182,7 @@ def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: flo
     return float(above_plane[within_width & within_length].max(initial=-math.inf))
 
 
-def _window(position: float, radius: float, nodes: int, cell_size: float) -> slice:
+def window(position: float, radius: float, nodes: int, cell_size: float) -> slice:
     """Returns the nodes of one axis within `radius` of `position`, and one more on either side against rounding."""
     first = math.ceil((position - radius) / cell_size) + nodes // 2 - 1
     last = math.floor((position + radius) / cell_size) + nodes // 2 + 1
