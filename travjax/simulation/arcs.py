@@ -14,7 +14,7 @@ from itertools import pairwise
 import jax
 import jax.numpy as jnp
 
-from travjax.simulation.events import Event, Margins, Pose, larger
+from travjax.simulation.events import Event, Margins, Nodes, Pose, Where, larger
 from travjax.simulation.footprint import Layout
 from travjax.simulation.grid import HIGHEST, Grid
 
@@ -47,6 +47,7 @@ class Poses:
 
     contact: of the four wheels
     step:    metres, largest step at each pose; None where it is the change of contact heights between poses
+    nodes:   where, on the original map; None unless it is asked for
     """
 
     contact: Sequence[jax.Array]
@@ -55,16 +56,23 @@ class Poses:
     roll: jax.Array
     steepness: jax.Array
     clearance: jax.Array
+    nodes: Nodes | None = None
 
 
-def arc_maxima(poses: Poses, layout: Layout, events: tuple[Event, ...]) -> jax.Array:
+def arc_maxima(poses: Poses, layout: Layout, events: tuple[Event, ...]) -> tuple[jax.Array, jax.Array | None]:
     """Returns the largest value of each event, and the largest height of contacts and clearances, along both arcs.
 
-    [E + 1, A, R, lanes]
+    [E + 1, A, R, lanes], and [2, E, A, R, lanes] the number of the pose and the node where each event is largest, if
+    nodes are asked for.
     """
+    arcs = _arc_poses(poses, layout)
     # The barrier keeps XLA from recomputing the maxima of a first arc for each second arc.
-    maxima = [jax.lax.optimization_barrier(pose_maxima(arc, events)) for arc in _arc_poses(poses, layout)]
-    return larger(*maxima)
+    maxima = [jax.lax.optimization_barrier(pose_maxima(arc, events)) for arc in arcs]
+    if poses.nodes is None:
+        return larger(*maxima), None
+    places = [pose_places(arc, events, first) for arc, first in zip(arcs, (0, layout.first_poses), strict=True)]
+    later = maxima[1][:-1] > maxima[0][:-1]
+    return larger(*maxima), jnp.where(later, places[1], places[0])
 
 
 def pose_maxima(poses: Sequence[Pose], events: tuple[Event, ...]) -> jax.Array:
@@ -73,6 +81,21 @@ def pose_maxima(poses: Sequence[Pose], events: tuple[Event, ...]) -> jax.Array:
     # Contacts and clearance are each reduced over the poses first: the obstacle event shares the largest clearance.
     ground = zip(*((*pose.contact, pose.clearance) for pose in poses), strict=True)
     return jnp.stack([*values, reduce(larger, (reduce(larger, heights) for heights in ground))])
+
+
+def pose_places(poses: Sequence[Pose], events: tuple[Event, ...], first: int) -> jax.Array:
+    """Returns the number of the pose, counted from `first`, and the node where each event is largest: [2, E, ...]."""
+    places = []
+    for event in events:
+        largest, node = event.value(poses[0]), event.node(poses[0])
+        number = jnp.full_like(node, first)
+        for count, pose in enumerate(poses[1:], first + 1):
+            value = event.value(pose)
+            more = value > largest
+            number, node = jnp.where(more, count, number), jnp.where(more, event.node(pose), node)
+            largest = larger(value, largest)
+        places.append(jnp.stack([number, node]))
+    return jnp.stack(places, axis=1)
 
 
 def _arc_poses(poses: Poses, layout: Layout) -> tuple[list[Pose], ...]:
@@ -96,8 +119,16 @@ def _arc_poses(poses: Poses, layout: Layout) -> tuple[list[Pose], ...]:
     else:
         changes = tuple([(field,) for field in part] for part in along(poses.step))
     others = [along(field) for field in (poses.pitch, poses.roll, poses.steepness, poses.clearance)]
+    if poses.nodes is None:
+        nodes: tuple = ([None] * len(first), [None] * len(second))
+    else:
+        *wheels, body, centre = (along(field) for field in (*poses.nodes.wheels, poses.nodes.body, poses.nodes.centre))
+        under = [list(zip(*(wheel[part] for wheel in wheels), strict=True)) for part in (0, 1)]
+        nodes = tuple(
+            [Nodes(*fields) for fields in zip(under[part], body[part], centre[part], strict=True)] for part in (0, 1)
+        )
     return tuple(
-        [Pose(*fields) for fields in zip(contact, changes[part], *(other[part] for other in others), strict=True)]
+        [Pose(*at) for at in zip(contact, changes[part], *(other[part] for other in others), nodes[part], strict=True)]
         for part, contact in enumerate((first, second))
     )
 
@@ -116,9 +147,26 @@ def margins_of(maxima: jax.Array, events: tuple[Event, ...]) -> Margins:
 
 
 def by_trajectory(maxima: jax.Array, source: jax.Array, maps: int) -> jax.Array:
-    """Puts the maxima of chunks of first arcs, [C, E + 1, A, R, lanes], in the order of trajectories: [E + 1, n, t].
+    """Puts results of chunks of first arcs, [C, E, A, R, lanes], in the order of trajectories: [E, n, t].
 
     source: NodeTable.source; maps: n
     """
     by_map = maxima.transpose(1, 0, 2, 3, 4).reshape(maxima.shape[1], -1, maps)
     return by_map[:, source].transpose(0, 2, 1)
+
+
+def on_map(nodes: jax.Array, layout: Layout) -> jax.Array:
+    """Turns nodes in the views of maps, [A P, lanes], into nodes of the maps."""
+    rows, cols = layout.grid.shape
+    by_view = nodes.reshape(len(nodes), len(layout.views), -1)
+    row, col = by_view // cols, by_view % cols
+    turned, mirrored = (jnp.array([axis in view.flipped for view in layout.views])[:, None] for axis in (0, 1))
+    return (jnp.where(turned, rows - 1 - row, row) * cols + jnp.where(mirrored, cols - 1 - col, col)).reshape(
+        nodes.shape
+    )
+
+
+def where_of(places: jax.Array, known: jax.Array, cols: int) -> Where:
+    """Makes Where of pose numbers and nodes [2, E, n, t]."""
+    pose, node = jnp.where(known, places, -1).transpose(0, 2, 3, 1)
+    return Where(pose, jnp.stack([node // cols, jnp.where(node < 0, -1, node % cols)], axis=-1))

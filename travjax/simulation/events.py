@@ -11,20 +11,34 @@ from functools import partial, reduce
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from travjax.config import require
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Where the robot touches the ground at one pose, as nodes (row * cols + col) of the map.
+
+    wheels: of each entry of Pose.change; body: of the clearance; centre: the node nearest to the robot's centre
+    """
+
+    wheels: tuple[jax.Array, ...]
+    body: jax.Array
+    centre: jax.Array
 
 
 @dataclass(frozen=True)
 class Pose:
     """The state of the robot at one pose; arrays of one shape with an element for each arc and map.
 
-    contact:     metres, height of the ground under each of the wheels FL, FR, RL, RR
-    change:      metres, change of each contact height since the previous pose; 0 at the first pose of a trajectory
+    contact:     metres, height of the ground under each of the wheels FL, FR, RL, RR, or at which they rest
+    change:      metres, change of each contact height since the previous pose, 0 at the first pose of a trajectory; or
+                 of the contact model `tyre` one entry, the largest step that a tyre reaches
     pitch, roll: slopes of the pose plane, forward and to the right
     steepness:   square of the pose plane's slope, pitch^2 + roll^2
     clearance:   metres, highest chassis node above the pose plane
+    nodes:       where that is; None unless it is asked for
     """
 
     contact: tuple[jax.Array, ...]
@@ -33,6 +47,7 @@ class Pose:
     roll: jax.Array
     steepness: jax.Array
     clearance: jax.Array
+    nodes: Nodes | None = None
 
 
 @dataclass(frozen=True)
@@ -46,6 +61,7 @@ class Event:
             same to the bit in any batch
     margin: computes the margin of a trajectory from the largest value at its poses, and must increase with it; the
             margin is that value unless given
+    node:   tells at which node the value is reached, of the pose's Nodes; the robot's centre unless given
     """
 
     name: str
@@ -53,6 +69,7 @@ class Event:
     limit: str
     value: Callable[[Pose], jax.Array]
     margin: Callable[[jax.Array], jax.Array] = lambda largest: largest
+    node: Callable[[Pose], jax.Array] = lambda pose: pose.nodes.centre
 
     def shown(self, margin: float) -> str:
         """Formats a margin, or an error of one, in metres or degrees."""
@@ -64,9 +81,18 @@ def larger(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.where(a > b, a, b)
 
 
+def _stepping_node(pose: Pose) -> jax.Array:
+    """Returns the node under the wheel that has the largest change."""
+    change, node = jnp.abs(pose.change[0]), pose.nodes.wheels[0]
+    for other, there in zip(pose.change[1:], pose.nodes.wheels[1:], strict=True):
+        node = jnp.where(jnp.abs(other) > change, there, node)
+        change = larger(jnp.abs(other), change)
+    return node
+
+
 PAPER = (
-    Event("step", "m", "max_step", lambda pose: reduce(larger, map(jnp.abs, pose.change))),
-    Event("obstacle", "m", "ride_height", lambda pose: pose.clearance),
+    Event("step", "m", "max_step", lambda pose: reduce(larger, map(jnp.abs, pose.change)), node=_stepping_node),
+    Event("obstacle", "m", "ride_height", lambda pose: pose.clearance, node=lambda pose: pose.nodes.body),
     Event("tilt", "rad", "max_tilt", lambda pose: pose.steepness, lambda largest: jnp.arctan(jnp.sqrt(largest))),
 )
 """The events of the paper (SPEC section 5), which every robot has."""
@@ -110,6 +136,20 @@ class Margins:
     def events(self) -> Float[Array, "*n t k"]:
         """Stacks all margins in the order of the robot's events: step, obstacle, tilt first."""
         return jnp.stack([self[name] for name in self.names], axis=-1)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["pose", "node"], meta_fields=[])
+@dataclass(frozen=True)
+class Where:
+    """Where every trajectory reaches its margin of each event, in the order of the robot's events.
+
+    pose: [n, t, k] int32 number of the pose, as in ActionSpace.poses; -1 is the last pose of a point turn before its end
+    node: [n, t, k, 2] int32 row and column on the map: the wheel's, the highest under the body, or the robot's centre
+    Both are -1 where the trajectory is unknown; read `pose` together with Margins.known, since turns are negative too.
+    """
+
+    pose: Int[Array, "*n t k"]
+    node: Int[Array, "*n t k 2"]
 
 
 UNKNOWN_LABEL = 0b0000_1000

@@ -22,9 +22,11 @@ from travjax.simulation.arcs import (
     by_trajectory,
     margins_of,
     node_lanes,
+    on_map,
     view_lanes,
+    where_of,
 )
-from travjax.simulation.events import PAPER, Event, Margins, larger
+from travjax.simulation.events import PAPER, Event, Margins, Nodes, Where, larger
 from travjax.simulation.footprint import RUN, Layout, chassis_places, node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -60,18 +62,25 @@ class _Chunks:
     singles: jax.Array
 
 
-def nearest_margins(maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid) -> Margins:
+def nearest_margins(
+    maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, where: bool = False
+) -> tuple[Margins, Where | None]:
     """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
-    chunks, source = _device_tables(robot, actions, grid, len(maps))
+    chunks, source = _device_tables(robot, actions, grid, len(maps), FEW_MAPS < len(maps) or where)
     layout = node_table(robot, actions, grid).layout
-    return _simulate(maps, chunks, source, robot.wheelbase, robot.track, layout, robot.events)
+    return _simulate(maps, chunks, source, robot.wheelbase, robot.track, layout, robot.events, where)
 
 
 @lru_cache(maxsize=8)
-def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
-    """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device."""
+def _device_tables(
+    robot: Robot, actions: ActionSpace, grid: Grid, maps: int, single: bool
+) -> tuple[_Chunks, jax.Array]:
+    """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device.
+
+    single: whether chassis nodes are read one by one, without runs
+    """
     table = node_table(robot, actions, grid)
-    runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
+    runs, singles = chassis_places(table.chassis, 1 if single else RUN)
     arcs = len(table.centre)
     if jax.default_backend() == "cpu":
         arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
@@ -102,22 +111,46 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
     return places.reshape(chunks, poses, 2, steps, each).transpose(0, 3, 1, 2, 4)
 
 
-@partial(jax.jit, static_argnames=("layout", "events"))
+@partial(jax.jit, static_argnames=("layout", "events", "where"))
 def _simulate(
-    maps, chunks: _Chunks, source, wheelbase, track, layout: Layout, events: tuple[Event, ...] = PAPER
-) -> Margins:
+    maps,
+    chunks: _Chunks,
+    source,
+    wheelbase,
+    track,
+    layout: Layout,
+    events: tuple[Event, ...] = PAPER,
+    where: bool = False,
+) -> tuple[Margins, Where | None]:
     grid = layout.grid
     by_node = node_lanes(above_centre(maps, grid))
     views = view_lanes(by_node, layout)
 
-    def simulate_chunk(chunk: _Chunks) -> jax.Array:
+    def simulate_chunk(chunk: _Chunks) -> tuple[jax.Array, jax.Array | None]:
         contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
         plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
-        clearance = _highest_above(views, plane, chunk, grid.nodes)
-        poses = Poses(contact, None, plane.pitch, plane.roll, plane.steepness, clearance)
+        if where:
+            clearance, body = _highest_node(views, plane, chunk, grid.nodes)
+            nodes = _nodes(chunk, body, layout)
+        else:
+            clearance, nodes = _highest_above(views, plane, chunk, grid.nodes), None
+        poses = Poses(contact, None, plane.pitch, plane.roll, plane.steepness, clearance, nodes)
         return arc_maxima(poses, layout, events)
 
-    return margins_of(by_trajectory(jax.lax.map(simulate_chunk, chunks), source, len(maps)), events)
+    maxima, places = jax.lax.map(simulate_chunk, chunks)
+    margins = margins_of(by_trajectory(maxima, source, len(maps)), events)
+    if places is None:
+        return margins, None
+    places = jnp.stack([by_trajectory(places[:, part], source, len(maps)) for part in (0, 1)])
+    return margins, where_of(places, margins.known, grid.nodes)
+
+
+def _nodes(chunk: _Chunks, body: jax.Array, layout: Layout) -> Nodes:
+    """Returns where the robot touches the ground at every pose: [A P, lanes] nodes of the map each."""
+    maps = body.shape[1] // len(layout.views)
+    wheels = tuple(jnp.repeat(wheel, maps, axis=1) for wheel in chunk.wheels)
+    centre = jnp.broadcast_to(chunk.centre[:, None], body.shape)
+    return Nodes(wheels, on_map(body, layout), on_map(centre, layout))
 
 
 def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
@@ -167,6 +200,28 @@ def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) 
         return highest
     in_runs = _scan_places(views, plane, chunk.centre, chunk.runs, RUN, cols)
     return reduce(larger, jnp.split(in_runs, RUN, axis=1), highest)
+
+
+def _highest_node(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> tuple[jax.Array, jax.Array]:
+    """Returns the largest height of a chassis node above the pose plane, and that node in the view: [A P, lanes] each.
+
+    All places of the chunk are single.
+    """
+
+    def step(best, group):
+        highest, at = best
+        for k in range(group.shape[-1]):
+            row, col = group[:, 0, k].astype(jnp.int32), group[:, 1, k].astype(jnp.int32)
+            node = chunk.centre + row * cols + col
+            height = views.at[node].get(mode="promise_in_bounds")
+            level = plane.level + plane.east * col[:, None].astype(jnp.float32)
+            above = height - (level + plane.north * row[:, None].astype(jnp.float32))
+            at = jnp.where(above > highest, node[:, None], at)
+            highest = larger(above, highest)
+        return (highest, at), None
+
+    lowest = jnp.full_like(plane.level, -UNKNOWN_HEIGHT)
+    return jax.lax.scan(step, (lowest, jnp.zeros(lowest.shape, jnp.int32)), chunk.singles)[0]
 
 
 def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:

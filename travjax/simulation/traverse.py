@@ -13,7 +13,7 @@ from travjax.batching import in_batches
 from travjax.config import require
 from travjax.jax_flags import usual_flags
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.events import UNKNOWN_LABEL, Margins, label_bit
+from travjax.simulation.events import UNKNOWN_LABEL, Margins, Where, label_bit
 from travjax.simulation.grid import Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.nearest import nearest_margins
@@ -52,7 +52,8 @@ def simulate(
     grid: Grid = Grid(),
     contact: str | None = None,
     turn: bool = True,
-) -> Margins:
+    where: bool = False,
+) -> Margins | tuple[Margins, Where]:
     """Simulates every trajectory on every map, and returns the margins.
 
     heights: [n, rows, cols] or [rows, cols] metres, NaN or masked where unknown; laid out as in grid.py. Any array of
@@ -68,13 +69,14 @@ def simulate(
     maps, alone = as_maps(heights, grid)
     robot, actions = chosen_robot(robot), chosen_actions(actions)
 
-    def simulate_batch(batch: jax.Array) -> Margins:
+    def simulate_batch(batch: jax.Array) -> tuple[Margins, Where | None]:
         if contact == "tyre":
-            return tyre_margins(batch, robot, actions, grid, turn)
-        return nearest_margins(batch, robot, actions, grid)
+            return tyre_margins(batch, robot, actions, grid, turn, where)
+        return nearest_margins(batch, robot, actions, grid, where)
 
-    margins = in_batches(simulate_batch, maps)
-    return jax.tree.map(lambda margin: margin[0], margins) if alone else margins
+    results = in_batches(simulate_batch, maps)
+    margins, places = jax.tree.map(lambda result: result[0], results) if alone else results
+    return (margins, places) if where else margins
 
 
 @usual_flags()

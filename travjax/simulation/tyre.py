@@ -12,7 +12,7 @@ from functools import lru_cache, partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from travjax.batching import rounded
 from travjax.simulation.actions import ActionSpace
@@ -24,11 +24,13 @@ from travjax.simulation.arcs import (
     by_trajectory,
     margins_of,
     node_lanes,
+    on_map,
     pose_maxima,
     view_lanes,
+    where_of,
 )
-from travjax.simulation.events import Margins, Pose, larger
-from travjax.simulation.footprint import Layout, node_table
+from travjax.simulation.events import Margins, Nodes, Pose, Where, larger
+from travjax.simulation.footprint import Layout, View, node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.steps import step_heights
@@ -99,12 +101,14 @@ def _scan_order(array: np.ndarray) -> np.ndarray:
     return array.reshape(chunks, poses, steps, each).transpose(0, 2, 1, 3)
 
 
-def tyre_margins(maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, turn: bool = True) -> Margins:
+def tyre_margins(
+    maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, turn: bool = True, where: bool = False
+) -> tuple[Margins, Where | None]:
     """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
     layout = node_table(robot, actions, grid).layout
     chunks, source = _arc_chunks(robot, actions, grid, len(maps))
     turns = _turns(robot, actions, grid) if turn else None
-    return _simulate(maps, chunks, source, turns, robot, layout)
+    return _simulate(maps, chunks, source, turns, robot, layout, where)
 
 
 @lru_cache(maxsize=8)
@@ -121,63 +125,85 @@ def _arc_chunks(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tu
         return chunks, jnp.asarray(table.source)
 
 
-@partial(jax.tree_util.register_dataclass, data_fields=["chunk", "passed", "turn"], meta_fields=[])
+@partial(jax.tree_util.register_dataclass, data_fields=["chunk", "passed", "left", "turn"], meta_fields=[])
 @dataclass(frozen=True)
 class _Turns:
     """The poses of all point turns, which lie around the circle, in one chunk.
 
-    passed: [turns, N] which poses each turn passes through; turn: [t] the turn of each trajectory
+    passed: [turns, N] which poses each turn passes through; left: [turns, N] how many poses are left from there to its
+            end; turn: [t] the turn of each trajectory
     """
 
     chunk: TyreChunks
     passed: Bool[Array, "turns N"]
+    left: Int[Array, "turns N"]
     turn: jax.Array
 
 
 @lru_cache(maxsize=8)
 def _turns(robot: Robot, actions: ActionSpace, grid: Grid) -> _Turns:
     """Puts the tables of the point turns on the device."""
-    headings, passed = turn_poses(actions)
+    headings, passed, left = turn_poses(actions)
     poses = np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=-1)
     with jax.ensure_compile_time_eval():
         chunk = jax.tree.map(lambda array: array[0], tyre_chunks(tyre_table(poses, robot, grid), 1))
         turn = actions.split(np.arange(len(actions)))[0]
-        return _Turns(chunk, jnp.asarray(passed), jnp.asarray(turn))
+        return _Turns(chunk, *map(jnp.asarray, (passed, left, turn)))
 
 
-def turn_poses(actions: ActionSpace) -> tuple[np.ndarray, np.ndarray]:
-    """Computes the headings of the poses of all point turns [N], and which of them each turn passes: [turns, N].
+def turn_poses(actions: ActionSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Computes the headings of the poses of all point turns: [N] radians, evenly around the circle.
 
-    A turn goes the shorter way round, the half circle anticlockwise.
+    Also returns which of them each turn passes, and how many are left from there to its end: [turns, N] each. A turn
+    goes the shorter way round, the half circle anticlockwise.
     """
     parts = math.ceil(2 * math.pi / actions.turns / TURN_STEP - 1e-9)
-    place, end = np.arange(actions.turns * parts), np.arange(actions.turns)[:, None] * parts
-    anticlockwise = 2 * end <= len(place)
+    count = actions.turns * parts
+    place, end = np.arange(count), np.arange(actions.turns)[:, None] * parts
+    anticlockwise = 2 * end <= count
     passed = np.where(anticlockwise, place <= end, (place >= end) | (place == 0))
-    return 2 * math.pi * place / len(place), passed
+    left = np.where(anticlockwise, end - place, np.where(place == 0, count, place) - end)
+    return 2 * math.pi * place / count, passed, left
 
 
-@partial(jax.jit, static_argnames=("robot", "layout"))
-def _simulate(maps, chunks: TyreChunks, source, turns: _Turns | None, robot: Robot, layout: Layout) -> Margins:
+@partial(jax.jit, static_argnames=("robot", "layout", "where"))
+def _simulate(
+    maps, chunks: TyreChunks, source, turns: _Turns | None, robot: Robot, layout: Layout, where: bool
+) -> tuple[Margins, Where | None]:
     grid, events = layout.grid, robot.events
     heights = above_centre(maps, grid)
-    by_node, by_node_steps = (
-        node_lanes(heights),
-        node_lanes(step_heights(heights, robot.wheel_diameter / 2, grid.spacing)),
-    )
+    steps = step_heights(heights, robot.wheel_diameter / 2, grid.spacing)
+    by_node, by_node_steps = node_lanes(heights), node_lanes(steps)
     views, view_steps = view_lanes(by_node, layout), view_lanes(by_node_steps, layout)
 
-    def simulate_chunk(chunk: TyreChunks) -> jax.Array:
-        return arc_maxima(settle(views, view_steps, chunk, robot, grid), layout, events)
+    def simulate_chunk(chunk: TyreChunks) -> tuple[jax.Array, jax.Array | None]:
+        return arc_maxima(settle(views, view_steps, chunk, robot, layout, where), layout, events)
 
-    maxima = by_trajectory(jax.lax.map(simulate_chunk, chunks), source, len(maps))
+    maxima, places = jax.lax.map(simulate_chunk, chunks)
+    maxima = by_trajectory(maxima, source, len(maps))
+    if places is not None:
+        places = jnp.stack([by_trajectory(places[:, part], source, len(maps)) for part in (0, 1)])
     if turns is not None:
-        poses = settle(by_node, by_node_steps, turns.chunk, robot, grid)
-        pose = Pose(poses.contact, (poses.step,), poses.pitch, poses.roll, poses.steepness, poses.clearance)
-        at_pose = pose_maxima([pose], events)  # [E + 1, N, n]
-        passed = jnp.where(turns.passed[..., None], at_pose[:, None], -UNKNOWN_HEIGHT)
-        maxima = larger(passed.max(axis=2)[:, turns.turn].transpose(0, 2, 1), maxima)
-    return margins_of(maxima, events)
+        turning = settle(by_node, by_node_steps, turns.chunk, robot, Layout(grid, (View(),), 0, 0, 0), where)
+        maxima, places = _with_turns(maxima, places, turning, turns, events)
+    margins = margins_of(maxima, events)
+    return margins, None if places is None else where_of(places, margins.known, grid.nodes)
+
+
+def _with_turns(maxima, places, poses: Poses, turns: _Turns, events) -> tuple[jax.Array, jax.Array | None]:
+    """Puts the point turns of trajectories into maxima [E + 1, n, t] and places [2, E, n, t]."""
+    fields = poses.contact, (poses.step,), poses.pitch, poses.roll, poses.steepness, poses.clearance
+    pose = Pose(*fields, poses.nodes)
+    passed = jnp.where(turns.passed[..., None], pose_maxima([pose], events)[:, None], -UNKNOWN_HEIGHT)
+    turning = passed.max(axis=2)[:, turns.turn].transpose(0, 2, 1)
+    if places is not None:
+        at = passed[:-1].argmax(axis=2)  # [E, turns, n]
+        number = -jnp.take_along_axis(turns.left[None, ..., None], at[:, :, None], axis=2)[:, :, 0]
+        nodes = jnp.stack([event.node(pose) for event in events])
+        node = jnp.take_along_axis(nodes[:, None], at[:, :, None], axis=2)[:, :, 0]
+        turned = jnp.stack([number, node])[:, :, turns.turn].transpose(0, 1, 3, 2)
+        places = jnp.where(turning[:-1] > maxima[:-1], turned, places)
+    return larger(turning, maxima), places
 
 
 def settle(
@@ -185,12 +211,15 @@ def settle(
     steps: Float[Array, "nodes lanes"],
     chunk: TyreChunks,
     robot: Robot,
-    grid: Grid,
+    layout: Layout,
+    where: bool = False,
 ) -> Poses:
     """Puts the robot on the ground at the poses of one chunk; contacts are the wheels' resting heights.
 
     heights: metres above the map's centre, UNKNOWN_HEIGHT where unknown; steps: metres, of steps.step_heights
+    where:   whether to find the nodes too
     """
+    grid = layout.grid
     cols, spacing, wheelbase, track = grid.nodes, grid.spacing, robot.wheelbase, robot.track
     right, forward = (jnp.array(signs)[None, :, None] for signs in ([-1, 1, -1, 1], [1, 1, -1, -1]))
     cos, sin = chunk.axes[:, :1], chunk.axes[:, 1:]
@@ -215,7 +244,8 @@ def settle(
     pitch, roll = (jnp.where(highest < UNKNOWN_HEIGHT / 2, slope, 0) for slope in slopes(start))
     for round_ in range(ROUNDS):
         east, north = a_cell(pitch, roll)
-        above, step = _on_tyres(heights, steps if round_ == ROUNDS - 1 else None, east, north, chunk, cols)
+        last = round_ == ROUNDS - 1
+        above, step, wheel = _on_tyres(heights, steps if last else None, east, north, chunk, cols, where and last)
         highest = larger(highest, above.max(axis=1))
         # A plane with the slopes so far lies at `above` under each wheel: their differences are what the slopes lack.
         plane = at_centre(east, north)[:, None] + rounded(pitch[:, None] * forward * (wheelbase / 2))
@@ -228,9 +258,13 @@ def settle(
     middle = (rest[:, 0] + rest[:, 1] + rest[:, 2] + rest[:, 3]) / 4
     east, north = a_cell(pitch, roll)
     level = jax.lax.optimization_barrier(middle - at_centre(east, north))
-    clearance = _clearance(heights, level, east, north, chunk, cols)
+    clearance, body = _clearance(heights, level, east, north, chunk, cols, where)
+    nodes = None
+    if where:
+        centre = jnp.broadcast_to(chunk.centre[:, None], body.shape)
+        nodes = Nodes((on_map(wheel, layout),), on_map(body, layout), on_map(centre, layout))
     contact = [jnp.where(highest < UNKNOWN_HEIGHT / 2, rest[:, wheel], UNKNOWN_HEIGHT) for wheel in range(4)]
-    return Poses(contact, step, pitch, roll, pitch * pitch + rounded(roll * roll), clearance)
+    return Poses(contact, step, pitch, roll, pitch * pitch + rounded(roll * roll), clearance, nodes)
 
 
 def _under_wheels(heights: jax.Array, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
@@ -245,43 +279,59 @@ def _under_wheels(heights: jax.Array, chunk: TyreChunks, cols: int) -> tuple[jax
     return jax.lax.optimization_barrier((ground, highest.max(axis=1)))
 
 
-def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
-    """Returns the height at which a plane through each pose's central node touches the tyres [N, 4, lanes], and the
-    largest step that they reach [N, lanes]; no step where `steps` is None.
+def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: bool):
+    """Returns the height at which a plane through each pose's central node touches the tyres [N, 4, lanes], the largest
+    step that they reach, and its node [N, lanes]; no step where `steps` is None, and no node unless `where`.
     """
     centre = jnp.repeat(chunk.centre, 4)
     east, north = (jnp.repeat(slope, 4, axis=0) for slope in (east, north))
 
     def scan(largest, places: _Scan):
-        above, reached = largest
+        above, reached, at = largest
         for k in range(places.row.shape[-1]):
-            row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
-            node, drop = centre + row * cols + col, places.height[:, k, None]
-            plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
+            node, plane = _plane_at(centre, east, north, places, k, cols)
+            drop = places.height[:, k, None]
             above = larger(_read(heights, node) - plane - drop, above)
             if steps is not None:
                 step = _read(steps, node)
-                reached = larger(jnp.where(step >= drop, step, 0), reached)
-        return (above, reached), None
+                step = jnp.where(step >= drop, step, 0)
+                at = jnp.where(step > reached, node[:, None], at) if where else at
+                reached = larger(step, reached)
+        return (above, reached, at), None
 
-    first = jnp.full_like(east, -UNKNOWN_HEIGHT), jnp.zeros_like(east)
-    above, reached = jax.lax.scan(scan, first, chunk.tyres)[0]
-    by_wheel = above.reshape(-1, 4, above.shape[-1]), reached.reshape(-1, 4, above.shape[-1]).max(axis=1)
-    return jax.lax.optimization_barrier(by_wheel)
+    nowhere = jnp.broadcast_to(centre[:, None], east.shape) if where else None
+    first = jnp.full_like(east, -UNKNOWN_HEIGHT), jnp.zeros_like(east), nowhere
+    above, reached, at = jax.lax.scan(scan, first, chunk.tyres)[0]
+    above, reached = (field.reshape(-1, 4, field.shape[-1]) for field in (above, reached))
+    if where:
+        largest = reached.argmax(axis=1, keepdims=True)
+        at = jnp.take_along_axis(at.reshape(reached.shape), largest, axis=1)[:, 0]
+    return jax.lax.optimization_barrier((above, reached.max(axis=1), at))
 
 
-def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int) -> jax.Array:
-    """Returns the largest height of a node of the outline above the pose plane and what is allowed there."""
+def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int, where: bool):
+    """Returns the largest height of a node of the outline above the pose plane and what is allowed there, and the node
+    in the view [N, lanes]; no node unless `where`.
+    """
 
-    def scan(highest, places: _Scan):
+    def scan(best, places: _Scan):
+        highest, at = best
         for k in range(places.row.shape[-1]):
-            row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
-            plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
-            height = _read(heights, chunk.centre + row * cols + col)
-            highest = larger(height - (level + plane) - places.height[:, k, None], highest)
-        return highest, None
+            node, plane = _plane_at(chunk.centre, east, north, places, k, cols)
+            above = _read(heights, node) - (level + plane) - places.height[:, k, None]
+            at = jnp.where(above > highest, node[:, None], at) if where else at
+            highest = larger(above, highest)
+        return (highest, at), None
 
-    return jax.lax.scan(scan, jnp.full_like(level, -UNKNOWN_HEIGHT), chunk.outline)[0]
+    nowhere = jnp.broadcast_to(chunk.centre[:, None], level.shape) if where else None
+    return jax.lax.scan(scan, (jnp.full_like(level, -UNKNOWN_HEIGHT), nowhere), chunk.outline)[0]
+
+
+def _plane_at(centre, east, north, places: _Scan, k: int, cols: int) -> tuple[jax.Array, jax.Array]:
+    """Returns the k-th node of every pose [N], and the height of the pose plane there above `centre` [N, lanes]."""
+    row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
+    plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
+    return centre + row * cols + col, plane
 
 
 def _read(lanes: jax.Array, nodes: jax.Array) -> jax.Array:
