@@ -18,14 +18,14 @@ import numpy as np
 from jaxtyping import Array, Bool, UInt8
 
 from travjax.batching import in_batches, rounded
-from travjax.config import require
 from travjax.jax_flags import usual_flags
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import PAPER, UNKNOWN_LABEL, Event, Margins, Pose, label_bit, larger
-from travjax.simulation.footprint import RUN, Layout, View, chassis_places, node_table
+from travjax.simulation.footprint import RUN, Layout, View, chassis_places
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup, chosen_robot
 
 FEW_MAPS = 2
 """For up to this many maps, RUN neighbouring nodes are read at once: the lanes alone do not fill a vector register."""
@@ -38,28 +38,6 @@ NODES_AT_ONCE = 8
 
 UNKNOWN_HEIGHT = 1e30
 """Stands for an unknown height inside the kernel: a maximum keeps it, whereas NaN would need a second pass."""
-
-
-@lru_cache(maxsize=1)
-def default_robot() -> Robot:
-    """Returns the Seekur Jr, the paper's robot."""
-    return Robot.load("seekur_jr")
-
-
-def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
-    """Tells whether both are the paper's, so that figures on synthetic maps can be compared with the paper's."""
-    return robot == default_robot() and actions == ActionSpace()
-
-
-def chosen_robot(robot: Robot | str | None) -> Robot:
-    """Returns the default robot for None, else the robot that `Robot.load` makes of the argument."""
-    return default_robot() if robot is None else Robot.load(robot)
-
-
-def chosen_actions(actions: ActionSpace | None) -> ActionSpace:
-    """Returns the paper's action space for None, else the given one; raises InputError if it is no ActionSpace."""
-    require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
-    return ActionSpace() if actions is None else actions
 
 
 @usual_flags()
@@ -82,12 +60,17 @@ def simulate(
     or a common marker of unknown ground such as -9999 (in a jax array, whose values are not checked, such heights count
     as unknown), and when a trajectory leaves the map or turns inside the robot.
     """
-    maps, alone = as_maps(heights, grid)
-    robot, actions = chosen_robot(robot), chosen_actions(actions)
-    layout = node_table(robot, actions, grid).layout
+    return margins_of(heights, Setup.chosen(robot, actions, grid))
+
+
+@usual_flags()
+def margins_of(heights: Heights, setup: Setup) -> Margins:
+    """Simulates every trajectory of a setup on every map; takes the heights and raises the errors of `simulate`."""
+    maps, alone = as_maps(heights, setup.grid)
+    robot, layout = setup.robot, setup.node_table().layout
 
     def simulate_batch(batch: jax.Array) -> Margins:
-        chunks, source = _device_tables(robot, actions, grid, len(batch))
+        chunks, source = _device_tables(setup, len(batch))
         return _simulate(batch, chunks, source, robot.wheelbase, robot.track, layout, robot.events)
 
     margins = in_batches(simulate_batch, maps)
@@ -159,9 +142,9 @@ class _Chunks:
 
 
 @lru_cache(maxsize=8)
-def _device_tables(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[_Chunks, jax.Array]:
+def _device_tables(setup: Setup, maps: int) -> tuple[_Chunks, jax.Array]:
     """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device."""
-    table = node_table(robot, actions, grid)
+    table = setup.node_table()
     runs, singles = chassis_places(table.chassis, RUN if maps <= FEW_MAPS else 1)
     arcs = len(table.centre)
     if jax.default_backend() == "cpu":
