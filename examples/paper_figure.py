@@ -16,6 +16,7 @@ import numpy as np
 
 import travjax
 from travjax.evaluation.map_figures import predicted_maps, save
+from travjax.simulation.setup import Setup
 
 MAPS = {"mountain_crater": 30, "rough": 9}
 """Styles of the maps and their seeds."""
@@ -23,7 +24,6 @@ MAPS = {"mountain_crater": 30, "rough": 9}
 
 def main(every: int = 3) -> Path:
     """Draws every so many trajectories on the maps; returns the picture."""
-    robot, actions, grid = travjax.Robot.load("seekur_jr"), travjax.ActionSpace(), travjax.Grid()
     heights = np.asarray(travjax.generate_terrain(list(MAPS), list(MAPS.values())))
     margins = travjax.simulate(heights)
     failed = np.asarray(travjax.failures(margins))
@@ -38,9 +38,7 @@ def main(every: int = 3) -> Path:
         failed[:, ::every],
         np.asarray(margins.known)[:, ::every],
         list(MAPS),
-        robot,
-        actions,
-        grid,
+        Setup(travjax.Robot.load("seekur_jr")),
         every=every,
     )
     Path("runs/examples").mkdir(parents=True, exist_ok=True)

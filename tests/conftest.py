@@ -1,4 +1,4 @@
-"""What the tests share: varied maps, settings of robot, actions and grid, and the `gpu` marker.
+"""What the tests share: varied maps, setups, and the `gpu` marker.
 
 Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
 
@@ -14,7 +14,6 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import hypothesis
 import jax
@@ -25,6 +24,7 @@ from tests.commandline import FEW_TOML
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.terrain.styles import STYLES, generate_terrain
 
 # A runner in the background ignores interrupts, and so would the programs that tests start and interrupt.
@@ -101,14 +101,6 @@ def map_name(request) -> str:
     return request.param
 
 
-class Setting(NamedTuple):
-    """Everything a node table depends on."""
-
-    robot: Robot
-    actions: ActionSpace
-    grid: Grid = Grid()
-
-
 SEEKUR_JR, HUSKY, LEO_ROVER = map(Robot.load, ("seekur_jr", "husky_a200", "leo_rover"))
 STRAIGHT = (math.inf,)
 CELL = Grid().spacing
@@ -116,15 +108,15 @@ CELL = Grid().spacing
 TIES = replace(SEEKUR_JR, track=9 * CELL, wheelbase=7 * CELL, chassis_width=6 * CELL, chassis_length=16 * CELL)
 """Where its centre is on a node and it faces along an axis, wheels are midway between nodes, chassis edges on nodes."""
 
-SETTINGS = {
-    "paper": Setting(SEEKUR_JR, ActionSpace()),
-    "odd number of turns": Setting(HUSKY, ActionSpace(turns=5, interval=0.11)),
-    "unpaired radii": Setting(LEO_ROVER, ActionSpace(turns=6, radii=(math.inf, 1.5, -0.9), interval=0.1)),
-    "odd turns and unpaired radii": Setting(SEEKUR_JR, ActionSpace(turns=3, radii=(1.5, math.inf, 4.0), interval=0.08)),
-    "arcs of different length": Setting(
+SETUPS = {
+    "paper": Setup(SEEKUR_JR, ActionSpace()),
+    "odd number of turns": Setup(HUSKY, ActionSpace(turns=5, interval=0.11)),
+    "unpaired radii": Setup(LEO_ROVER, ActionSpace(turns=6, radii=(math.inf, 1.5, -0.9), interval=0.1)),
+    "odd turns and unpaired radii": Setup(SEEKUR_JR, ActionSpace(turns=3, radii=(1.5, math.inf, 4.0), interval=0.08)),
+    "arcs of different length": Setup(
         HUSKY, ActionSpace(turns=2, arc_lengths=(1.0, 2.2), radii=(-1.2, math.inf, 1.2), interval=0.15)
     ),
-    "ties and quarter circles": Setting(
+    "ties and quarter circles": Setup(
         TIES,
         ActionSpace(
             turns=4,
@@ -133,44 +125,42 @@ SETTINGS = {
             interval=2 * CELL,
         ),
     ),
-    "ties on and between nodes": Setting(
+    "ties on and between nodes": Setup(
         TIES, ActionSpace(turns=4, radii=STRAIGHT, arc_lengths=(8 * CELL, 12 * CELL), interval=CELL / 2)
     ),
-    "coarse small map": Setting(
+    "coarse small map": Setup(
         HUSKY,
         ActionSpace(turns=4, arc_lengths=(0.6, 0.5), radii=(math.inf, 0.7, -0.7), interval=0.1),
         Grid(4, 0.125),
     ),
-    "fine large map": Setting(
-        SEEKUR_JR, ActionSpace(turns=8, radii=(math.inf, 2.0, -2.0), interval=0.1), Grid(10, 0.05)
-    ),
-    "chassis without four nodes in a row": Setting(
+    "fine large map": Setup(SEEKUR_JR, ActionSpace(turns=8, radii=(math.inf, 2.0, -2.0), interval=0.1), Grid(10, 0.05)),
+    "chassis without four nodes in a row": Setup(
         replace(SEEKUR_JR, chassis_width=0.1, chassis_length=0.1),
         ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5), interval=0.1),
     ),
-    "chassis with four nodes in some rows": Setting(
+    "chassis with four nodes in some rows": Setup(
         replace(SEEKUR_JR, chassis_width=0.2, chassis_length=0.3),
         ActionSpace(turns=4, radii=(math.inf, 1.5, -1.5), interval=0.1),
     ),
-    "chassis of few nodes": Setting(
+    "chassis of few nodes": Setup(
         replace(SEEKUR_JR, chassis_width=0.3, chassis_length=0.2), ActionSpace(turns=2, radii=STRAIGHT, interval=0.1)
     ),
-    "chassis with four nodes in all rows": Setting(
+    "chassis with four nodes in all rows": Setup(
         SEEKUR_JR, ActionSpace(turns=1, radii=STRAIGHT, arc_lengths=(0.5, 0.5), interval=0.5)
     ),
-    "chassis longer than 127 nodes": Setting(
+    "chassis longer than 127 nodes": Setup(
         replace(SEEKUR_JR, chassis_length=2.1),
         ActionSpace(turns=2, radii=STRAIGHT, arc_lengths=(0.2, 0.2), interval=0.2),
         Grid(4, 1 / 128),
     ),
 }
-"""Settings that take different ways through the tables and the kernel."""
+"""Setups that take different ways through the tables and the kernel."""
 
 
-@pytest.fixture(scope="module", params=SETTINGS)
-def setting(request) -> Setting:
-    """Each of the settings in turn."""
-    return SETTINGS[request.param]
+@pytest.fixture(scope="module", params=SETUPS)
+def setup(request) -> Setup:
+    """Each of the setups in turn."""
+    return SETUPS[request.param]
 
 
 @pytest.fixture(scope="session")

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 
 from tests import small_training
-from tests.commandline import FEW
-from tests.small_training import GRID, HUSKY, dataset
+from tests.small_training import SETUP, dataset
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.devices import Devices
 from travjax.estimators.preset import EvaluationConfig, Preset, TrainingConfig
@@ -44,7 +43,7 @@ PRESET = Preset(
 )
 """18 training maps, so 5 steps an epoch, the last of which is filled up."""
 
-RUN = Run(PRESET, HUSKY, FEW, GRID)
+RUN = Run(PRESET, SETUP)
 
 
 def random_variables(seed: int = 0):

@@ -21,9 +21,11 @@ from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.training.trainer import Trainer
 
 HUSKY, GRID = Robot.load("husky_a200"), Grid(4, 0.125)
+SETUP = Setup(HUSKY, FEW, GRID)
 GRID_WORDS = ("--size", 4, "--spacing", 0.125)
 
 TOML = """
@@ -82,7 +84,7 @@ PRESET = Preset(
 @functools.cache
 def dataset() -> Dataset:
     """The data set of PRESET: all three events fail in each split."""
-    return generate(PRESET.dataset, HUSKY, FEW, GRID)
+    return generate(PRESET.dataset, SETUP)
 
 
 @functools.cache
@@ -119,7 +121,7 @@ def in_training(graph, variables, images, key):
 
 def run_of(**training) -> Run:
     """PRESET's run with other settings of training."""
-    return Run(replace(PRESET, training=replace(PRESET.training, **training)), HUSKY, FEW, GRID)
+    return Run(replace(PRESET, training=replace(PRESET.training, **training)), SETUP)
 
 
 def trainer(folder: Path, data: Dataset | None = None, **training) -> Trainer:

@@ -8,9 +8,9 @@ from travjax.config import InputError
 from travjax.data.map_batches import WindowOptions
 from travjax.entry import Parser
 from travjax.rasters.reading_options import DemOptions
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 
 def parser() -> Parser:
@@ -26,7 +26,7 @@ def parser() -> Parser:
 
 def test_defaults_are_those_of_the_library():
     arguments = parser().parse_args([])
-    assert options.setup(arguments) == (Grid(), Robot.load("seekur_jr"), ActionSpace())
+    assert options.setup(arguments) == Setup(Robot.load("seekur_jr"))
     assert options.windows(arguments) == WindowOptions()
     assert (options.count(arguments), options.seed(arguments)) == (7, 0)
 
@@ -35,7 +35,7 @@ def test_what_is_given_is_taken(few):
     words = ["--robot", "husky_a200", "--actions", few, "--size", 4, "--spacing", 0.125, "--stride", 3, "--up", "y"]
     words += ["--keep-holes", "--allow-coarse", "--classes", "2,9", "--gdal-driver", "BAG", "--count", 2, "--seed", 5]
     arguments = parser().parse_args([*map(str, words)])
-    assert options.setup(arguments) == (Grid(4, 0.125), Robot.load("husky_a200"), FEW)
+    assert options.setup(arguments) == Setup(Robot.load("husky_a200"), FEW, Grid(4, 0.125))
     reading = DemOptions(classes=(2, 9), up="y", gdal_drivers=("BAG",))
     assert options.windows(arguments) == WindowOptions(reading, 3.0, fill_holes=False, allow_coarse=True)
     assert (options.count(arguments), options.seed(arguments)) == (2, 5)

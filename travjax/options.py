@@ -8,10 +8,9 @@ from travjax.config import require
 from travjax.data.map_batches import MapStream, WindowOptions
 from travjax.files import user_path
 from travjax.rasters.reading_options import AXES_UP, DemOptions
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.setup import load_setup
+from travjax.simulation.setup import Setup
 from travjax.terrain.rock_field import STYLE as ROCK_FIELD
 from travjax.terrain.styles import STYLES
 
@@ -171,9 +170,9 @@ def seed(arguments: argparse.Namespace) -> int:
     return seed
 
 
-def setup(arguments: argparse.Namespace) -> tuple[Grid, Robot, ActionSpace]:
-    """Returns grid, robot and action space; raises InputError early where they do not fit together."""
-    return load_setup(arguments.robot, arguments.actions, arguments.size, arguments.spacing)
+def setup(arguments: argparse.Namespace) -> Setup:
+    """Returns robot, action space and grid; raises InputError early where they do not fit together."""
+    return Setup.load(arguments.robot, arguments.actions, arguments.size, arguments.spacing)
 
 
 def windows(arguments: argparse.Namespace) -> WindowOptions:

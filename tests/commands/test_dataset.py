@@ -21,6 +21,7 @@ from travjax.evaluation.dataset_tables import statistics_table, windows_table
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 GRID = Grid(4, 0.125)
 SMALL = ("--size", 4, "--spacing", 0.125)
@@ -45,7 +46,7 @@ def assert_equal(one: dataset.Dataset, other: dataset.Dataset):
 
 
 def test_the_data_set_is_the_one_that_generate_makes(made):
-    assert_equal(load(made.folder), generate(CONFIG, Robot.load("husky_a200"), FEW, GRID))
+    assert_equal(load(made.folder), generate(CONFIG, Setup(Robot.load("husky_a200"), FEW, GRID)))
 
 
 def test_the_export_is_read_back_equal(made):
@@ -140,7 +141,7 @@ def config_of(dems) -> SitesConfig:
 
 def test_dem_files_become_the_data_set_of_their_sites(real, dems):
     loaded = load(real.folder)
-    assert_equal(loaded, sites.read(config_of(dems), Robot.load("husky_a200"), FEW, GRID))
+    assert_equal(loaded, sites.read(config_of(dems), Setup(Robot.load("husky_a200"), FEW, GRID)))
     assert loaded.provenance.config == config_of(dems)
     assert set(loaded.group.tolist()) == {"yard", "field"} and all(len(loaded.maps_of(s)) for s in dataset.SPLITS)
 
@@ -280,7 +281,7 @@ def test_real_maps_are_not_beside_the_paper(tmp_path):
     actions, grid = ActionSpace(), Grid()
     heights, labels = np.zeros((3, *grid.shape), np.float32), np.zeros((3, len(actions)), np.uint8)
     group, seed, split = np.array(["quarry"] * 3), np.zeros(3, np.uint32), np.arange(3, dtype=np.uint8)
-    real = dataset.Dataset(heights, labels, group, seed, split, Robot.load("seekur_jr"), actions, grid, None)
+    real = dataset.Dataset(heights, labels, group, seed, split, Setup(Robot.load("seekur_jr"), actions, grid), None)
     dataset.save(real, tmp_path / "real")
     out = run_words("dataset", "--check", tmp_path / "real")[1]
     assert "quarry" in out

@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commandline import FEW, FEW_TOML, files, printed_files, run, run_words
+from tests.commandline import FEW_TOML, files, printed_files, run, run_words
 from tests.commandline import Run as Done
 from tests.small_training import (
-    GRID,
     GRID_WORDS,
-    HUSKY,
     PRESET,
+    SETUP,
     TOML,
     copy,
     dataset,
@@ -132,7 +131,7 @@ def test_progress_is_shown_with_the_loss_a_rate_and_the_time_left(trained):
 
 
 def test_the_run_is_what_was_asked_for(trained):
-    assert Run.load(trained) == Run(PRESET, HUSKY, FEW, GRID)
+    assert Run.load(trained) == Run(PRESET, SETUP)
 
 
 def test_a_run_makes_its_own_data_set_unless_one_is_given(tmp_path, few):

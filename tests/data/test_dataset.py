@@ -11,27 +11,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.config import InputError
 from travjax.data import dataset as module
 from travjax.data import dataset_json
-from travjax.data.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load, require_matching
+from travjax.data.dataset import ARRAYS, SPLITS, Dataset, DatasetConfig, generate, load
 from travjax.data.dataset import save as save_dataset
 from travjax.data.provenance import PROVENANCE_ARRAYS, Provenance, Site, SiteRecord, SitesConfig
 from travjax.files import atomic_write_folder
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import label, simulate, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain
 
-ROBOT, ACTIONS, GRID = SETTINGS["coarse small map"]
+SETUP = SETUPS["coarse small map"]
+ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid
 CONFIG = DatasetConfig(maps=64, seed=3, validation=0.2, test=0.1)
 
 
 @pytest.fixture(scope="module")
 def made() -> Dataset:
-    return generate(CONFIG, ROBOT, ACTIONS, GRID)
+    return generate(CONFIG, SETUP)
 
 
 def real_maps(count: int = 6) -> Dataset:
@@ -42,7 +44,7 @@ def real_maps(count: int = 6) -> Dataset:
     labels[0, ::2] = 8
     group = np.array([f"site {number % 2}" for number in range(count)])
     split = np.arange(count, dtype=np.uint8) % 3
-    return Dataset(heights, labels, group, np.zeros(count, np.uint32), split, ROBOT, ACTIONS, GRID, None)
+    return Dataset(heights, labels, group, np.zeros(count, np.uint32), split, SETUP, None)
 
 
 def placed_maps() -> Dataset:
@@ -92,7 +94,7 @@ def test_each_map_is_the_one_of_its_style_and_seed_with_its_labels(made):
 def test_the_same_arguments_give_the_same_data_set_whatever_the_chunks(made, monkeypatch):
     monkeypatch.setattr(module, "MAPS_AT_ONCE", 32)
     added: list[int] = []
-    again = generate(CONFIG, ROBOT, ACTIONS, GRID, added.append)
+    again = generate(CONFIG, SETUP, added.append)
     assert_equal(again, made)
     assert added == [32, 32]
 
@@ -140,7 +142,7 @@ def test_maps_and_splits_are_the_same_on_every_machine_and_version():
 
 def test_a_configuration_that_does_not_fit_is_refused_before_anything_is_made():
     with pytest.raises(InputError):
-        generate(CONFIG, ROBOT, ActionSpace(), GRID, lambda count: pytest.fail("a map was made"))
+        generate(CONFIG, Setup(ROBOT, ActionSpace(), GRID), lambda count: pytest.fail("a map was made"))
 
 
 # Splits
@@ -208,38 +210,6 @@ def test_bad_configurations_are_named(values, message):
 
 
 # What belongs together
-
-
-def test_the_same_robot_actions_and_grid_are_accepted(made):
-    require_matching(made, Robot.load("husky_a200"), replace(ACTIONS), Grid(4, 0.125))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            {"robot": replace(ROBOT, max_step=0.5)},
-            "robot of the data set: max_step = 0.0826; must be as here: max_step = 0.5",
-        ),
-        (
-            {"actions": replace(ACTIONS, turns=7, interval=0.2)},
-            "actions of the data set: turns = 4, interval = 0.1; must be as here: turns = 7, interval = 0.2",
-        ),
-        ({"grid": Grid(4, 0.25)}, "grid of the data set: spacing = 0.125; must be as here: spacing = 0.25"),
-    ],
-)
-def test_another_robot_action_space_or_grid_is_refused_and_both_are_named(made, change, message):
-    with pytest.raises(InputError) as raised:
-        require_matching(made, **({"robot": ROBOT, "actions": ACTIONS, "grid": GRID} | change))
-    assert str(raised.value) == message
-
-
-def test_a_robot_that_differs_in_much_is_named_in_one_line(made):
-    with pytest.raises(
-        InputError, match="^robot of the data set: name = 'Husky A200'.*here: name = 'Seekur Jr'"
-    ) as raised:
-        require_matching(made, Robot.load("seekur_jr"), ACTIONS, GRID)
-    assert len(str(raised.value)) < 400 and "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -594,7 +564,7 @@ def large() -> Dataset:
         "seed": np.zeros(count, np.uint32),
         "split": np.zeros(count, np.uint8),
     }
-    return Dataset(**arrays, robot=ROBOT, actions=actions, grid=grid, config=None)
+    return Dataset(**arrays, setup=Setup(ROBOT, actions, grid), config=None)
 
 
 def peak_of(function) -> int:
@@ -617,10 +587,10 @@ def test_generating_allocates_the_arrays_once(monkeypatch):
     monkeypatch.setattr(module, "MAPS_AT_ONCE", 64)
     config = DatasetConfig(maps=640)
     size = config.maps * (GRID.nodes**2 * 4 + len(ACTIONS))
-    assert peak_of(lambda: generate(config, ROBOT, ACTIONS, GRID)) < 1.3 * size
+    assert peak_of(lambda: generate(config, SETUP)) < 1.3 * size
 
 
 def test_a_data_set_holds_the_very_arrays_that_it_was_given(large):
-    again = replace(large, robot=Robot.load("seekur_jr"))
+    again = replace(large, setup=replace(large.setup, robot=Robot.load("seekur_jr")))
     assert np.shares_memory(again.heights, large.heights)
     assert np.shares_memory(again.labels, large.labels)

@@ -13,11 +13,13 @@ from travjax.rasters.reading_options import DemOptions
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import simulate
 from travjax.terrain.styles import generate_terrain
 
 GRID, HUSKY = Grid(4, 0.125), Robot.load("husky_a200")
 ACTIONS = ActionSpace(turns=2, arc_lengths=(0.6, 0.5), radii=(float("inf"),), interval=0.1)
+SETUP = Setup(HUSKY, ACTIONS, GRID)
 
 
 @pytest.mark.parametrize("event", ["step", "obstacle", "tilt"])
@@ -27,11 +29,11 @@ def test_a_margin_that_is_no_number_on_known_ground_is_an_error(monkeypatch, eve
     heights[0, -12:] = np.nan  # ahead of the first trajectory
     margins = simulate(heights, HUSKY, ACTIONS, grid=GRID)
     assert np.asarray(margins.known).tolist() == [[False, True]]
-    assert not map_batches.labelled({"heights": heights}, HUSKY, ACTIONS, GRID)["failed"].any()
+    assert not map_batches.labelled({"heights": heights}, SETUP)["failed"].any()
     spoilt = replace(margins, **{event: getattr(margins, event).at[0, 1].set(value)})
-    monkeypatch.setattr(map_batches, "simulate", lambda *arguments, **options: spoilt)
+    monkeypatch.setattr(map_batches, "margins_of", lambda *arguments, **options: spoilt)
     with pytest.raises(InputError, match=f"^margins of {HUSKY.name} = .*: must be finite where the ground is known$"):
-        map_batches.labelled({"heights": heights}, HUSKY, ACTIONS, GRID)
+        map_batches.labelled({"heights": heights}, SETUP)
 
 
 # ---- Streams of maps

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.config import InputError
 from travjax.data import sites
 from travjax.data.dataset import Dataset, load, save
@@ -18,7 +18,8 @@ from travjax.files import sha256
 from travjax.simulation.reference import simulate_trajectory
 from travjax.simulation.traverse import unpacked
 
-ROBOT, ACTIONS, GRID = SETTINGS["coarse small map"]
+SETUP = SETUPS["coarse small map"]
+ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid
 SIZE, CELL = GRID.size, GRID.spacing
 
 
@@ -40,7 +41,7 @@ def site_file(path: Path, east=26.0, north=40.0, origin=(500.0, 9000.0), crs="LO
 
 
 def made(config: SitesConfig, **options) -> Dataset:
-    return read(config, ROBOT, ACTIONS, GRID, **options)
+    return read(config, SETUP, **options)
 
 
 @pytest.fixture(scope="module")
@@ -357,7 +358,7 @@ def test_files_are_found_under_travjax_data(files, tmp_path, monkeypatch):
     assert (record.file, record.sha256) == (f"{folder.name}/dale.npz", sha256(Path(files["dale"])))
 
 
-def test_reading_settings_are_those_of_the_site_and_the_config(tmp_path):
+def test_reading_setups_are_those_of_the_site_and_the_config(tmp_path):
     heights = np.rint(1000 * ground(*np.meshgrid(np.arange(65) * 0.25, np.arange(49) * 0.25))).astype(np.int16)
     heights[10:14, 10:14] = 7
     np.save(tmp_path / "map.npy", heights)
@@ -450,4 +451,4 @@ def test_what_load_dem_refuses_names_the_file(tmp_path):
 
 def test_a_robot_that_does_not_fit_is_refused_before_anything_is_read():
     with pytest.raises(InputError, match="leave the"):
-        read(SitesConfig((Site("none.tif"),)), ROBOT, SETTINGS["paper"].actions, GRID)
+        read(SitesConfig((Site("none.tif"),)), replace(SETUP, actions=SETUPS["paper"].actions))

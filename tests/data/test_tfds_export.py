@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.config import InputError
 from travjax.data.dataset import SPLITS, Dataset, DatasetConfig
 from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.data.tfds_export import NAME, VERSION, export, read
 from travjax.terrain.styles import STYLES
 
-ROBOT, ACTIONS, GRID = SETTINGS["coarse small map"]
+SETUP = SETUPS["coarse small map"]
+ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid
 
 
 def some_data(maps: int = 40, config: DatasetConfig | None = None, shift: int = 0) -> Dataset:
@@ -29,7 +30,7 @@ def some_data(maps: int = 40, config: DatasetConfig | None = None, shift: int = 
     heights[:, 0, shift] = np.nan
     labels = rng.integers(0, 9, (maps, len(ACTIONS))).astype(np.uint8)
     config = config or DatasetConfig(maps, 5, 0.2, 0.1)
-    return Dataset(heights, labels, config.styles(), config.seeds(), config.splits(), ROBOT, ACTIONS, GRID, config)
+    return Dataset(heights, labels, config.styles(), config.seeds(), config.splits(), SETUP, config)
 
 
 @pytest.fixture(scope="module")
@@ -67,9 +68,7 @@ def test_a_split_without_maps_is_left_out(tmp_path):
 
 @pytest.fixture(scope="module")
 def real(data) -> Dataset:
-    return Dataset(
-        data.heights, data.labels, np.full(40, "Möckeln"), data.seed * 0, data.split, ROBOT, ACTIONS, GRID, None
-    )
+    return Dataset(data.heights, data.labels, np.full(40, "Möckeln"), data.seed * 0, data.split, SETUP, None)
 
 
 def test_real_maps_keep_their_site(real, tmp_path):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.commandline import FEW
-from tests.conftest import SEEKUR_JR, SETTINGS
+from tests.conftest import SEEKUR_JR, SETUPS
 from tests.field_runs import PRESET
-from tests.small_training import GRID, HUSKY, dataset
+from tests.small_training import GRID, HUSKY, SETUP, dataset
 from travjax.config import InputError
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.estimators.map_samples import MapSamples, MapSource
@@ -29,7 +29,7 @@ def data_of(preset=CLEAN, data=None, **training) -> MapSamples:
 def shown(prepared) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Heights above the centre, the trajectories that are read, and their targets: margins and known."""
     (elevation, part), (margins, known) = prepared
-    table = stencil(HUSKY, FEW, GRID)
+    table = stencil(SETUP)
     arcs = [int(np.flatnonzero((table.nodes == nodes).all(axis=(1, 2))).item()) for nodes in part.nodes]
     assert (part.first_poses, part.second_arcs) == (table.first_poses, table.second_arcs)
     trajectories = np.concatenate([np.arange(len(FEW.radii)) + arc * len(FEW.radii) for arc in arcs])
@@ -56,7 +56,7 @@ def test_labels_of_another_view_are_permuted_labels_of_the_map(size, maps):
         robot, actions, grid = SEEKUR_JR, ActionSpace(), Grid()
         heights = np.stack([maps[name] for name in ("mountain_crater", "scattered_sharp", "holes")])
     else:
-        robot, actions, grid = HUSKY, FEW, GRID
+        robot, actions, grid = SETUP
         heights = dataset().heights[:8]
     views = views_of(actions)
     assert len(views) == 4
@@ -77,7 +77,7 @@ def test_labels_of_another_view_are_permuted_labels_of_the_map(size, maps):
 
 @pytest.mark.parametrize("name", ["paper", "odd number of turns", "unpaired radii", "arcs of different length"])
 def test_the_trajectories_of_a_view_are_those_of_the_map_and_twice_turned_is_as_it_was(name):
-    actions = SETTINGS[name].actions
+    actions = SETUPS[name].actions
     for view in views_of(actions):
         order = view.trajectories(actions)
         np.testing.assert_array_equal(np.sort(order), np.arange(len(actions)))
@@ -142,7 +142,7 @@ def test_a_step_is_the_same_each_time_and_unlike_another_step_or_seed():
     assert len(arcs) > 3
 
 
-def test_the_arcs_of_a_step_are_different_and_as_many_as_the_setting_says():
+def test_the_arcs_of_a_step_are_different_and_as_many_as_the_setup_says():
     maps = dataset().maps_of("train")[:1]
     for each, count in ((1, 1), (3, 1), (7, 2), (9, 3), (999, 6)):
         trajectories = shown(data_of(trajectories_per_map=each, failing_per_map=0).prepared(maps, 0))[1]
@@ -232,7 +232,7 @@ def test_the_summary_counts():
 
 
 def test_a_source_is_of_all_trajectories_and_of_maps_relative_to_their_centre():
-    source = MapSource.from_maps(dataset().heights, HUSKY, FEW, GRID, 0.5)
-    assert source.stencil is stencil(HUSKY, FEW, GRID)
+    source = MapSource.from_maps(dataset().heights, SETUP, 0.5)
+    assert source.stencil is stencil(SETUP)
     wanted = np.stack([above_centre(dataset().heights[index]) for index in (3, 1)]) / 0.5
     np.testing.assert_allclose(source.elevation(np.array([3, 1])), wanted, atol=1e-6)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.data.dataset import SPLITS, Dataset, DatasetConfig
 from travjax.data.provenance import Provenance, Site, SiteRecord, SitesConfig
 from travjax.data.sampling import balanced_subset
@@ -20,7 +20,8 @@ from travjax.evaluation.dataset_tables import (
 from travjax.simulation.traverse import unpacked
 from travjax.terrain.styles import STYLES
 
-ROBOT, ACTIONS, GRID = SETTINGS["coarse small map"]
+SETUP = SETUPS["coarse small map"]
+ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,7 @@ def dataset() -> Dataset:
     group = np.array(["b", "a", "c"])[np.arange(90) // 30]
     split = rng.choice(3, 90, p=(0.7, 0.2, 0.1)).astype(np.uint8)
     heights = np.zeros((90, *GRID.shape), np.float32)
-    return Dataset(
-        heights, labels.astype(np.uint8), group, np.zeros(90, np.uint32), split, ROBOT, ACTIONS, GRID, config=None
-    )
+    return Dataset(heights, labels.astype(np.uint8), group, np.zeros(90, np.uint32), split, SETUP, config=None)
 
 
 def slow_row(labels: np.ndarray) -> dict:
@@ -124,9 +123,7 @@ def test_the_table_has_a_line_for_each_row(dataset):
 
 def test_a_group_without_known_trajectories_has_no_shares(dataset):
     dark = np.full(90, 8, np.uint8)[:, None].repeat(len(ACTIONS), axis=1)
-    whole = Dataset(
-        dataset.heights, dark, dataset.group, dataset.seed, np.zeros(90, np.uint8), ROBOT, ACTIONS, GRID, None
-    )
+    whole = Dataset(dataset.heights, dark, dataset.group, dataset.seed, np.zeros(90, np.uint8), SETUP, None)
     rows = rows_of(whole)
     assert rows["all maps"]["step"] == rows["all maps"]["none"] == "-" and rows["all maps"]["known"] == "0.0%"
     assert rows["test"]["maps"] == 0 and rows["test"]["known"] == "-"

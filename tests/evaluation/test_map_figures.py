@@ -14,10 +14,12 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 SEEKUR_JR = Robot.load("seekur_jr")
 FEW = ActionSpace(turns=4, radii=(math.inf, 1.2, -1.2))
 GRID = Grid(8.0, 0.125)
+SETUP = Setup(SEEKUR_JR, FEW, GRID)
 DPI = 150
 
 
@@ -175,7 +177,7 @@ def labelled(failed: np.ndarray, known: np.ndarray, heights: np.ndarray | None =
     if heights is None:
         heights = np.zeros((len(failed), *GRID.shape), np.float32)
     names = [f"map {number}" for number in range(len(failed))]
-    return map_figures.labelled_maps(heights, failed, known, names, SEEKUR_JR, actions, GRID)
+    return map_figures.labelled_maps(heights, failed, known, names, Setup(SEEKUR_JR, actions, GRID))
 
 
 def paths(ax) -> dict[str, int]:
@@ -290,7 +292,7 @@ def predicted(probabilities: np.ndarray, failed: np.ndarray, known: np.ndarray) 
     """The figure of maps of random ground, on few actions."""
     heights = np.random.default_rng(0).standard_normal((len(failed), *GRID.shape)).astype(np.float32)
     names = [f"map {number}" for number in range(len(failed))]
-    return map_figures.predicted_maps(heights, {"predicted": probabilities}, failed, known, names, SEEKUR_JR, FEW, GRID)
+    return map_figures.predicted_maps(heights, {"predicted": probabilities}, failed, known, names, SETUP)
 
 
 def of_event(figure: Figure, event: str) -> tuple:
@@ -330,7 +332,7 @@ def test_several_predictions_stand_below_each_other_and_the_truth_is_last(tmp_pa
     before, after = np.full((2, 36, 3), 0.9), np.full((2, 36, 3), 0.1)
     heights = np.zeros((2, *GRID.shape), np.float32)
     names, predictions = ["one", "two"], {"before": before, "after": after}
-    figure = map_figures.predicted_maps(heights, predictions, failed, known, names, SEEKUR_JR, FEW, GRID)
+    figure = map_figures.predicted_maps(heights, predictions, failed, known, names, SETUP)
     pixels(figure, tmp_path)
     shown = [ax for ax in figure.axes if ax.get_title().startswith("tilt, ")]
     assert [ax.get_title().split(":")[0] for ax in shown] == ["tilt, before", "tilt, after", "tilt, true"] * 2
@@ -345,7 +347,7 @@ def test_several_predictions_stand_below_each_other_and_the_truth_is_last(tmp_pa
 def test_every_so_many_trajectories_are_said_to_be_that():
     shown, known = np.zeros((1, 8, 3)), np.ones((1, 8), bool)
     heights = np.zeros((1, *GRID.shape), np.float32)
-    settings = (["one"], SEEKUR_JR, FEW, GRID)
+    settings = (["one"], SETUP)
     figure = map_figures.predicted_maps(
         heights, {"predicted": shown}, shown > 1, known, *settings, "simulator", every=5
     )
@@ -425,7 +427,7 @@ def test_the_robot_is_drawn_to_scale():
 
 @pytest.mark.parametrize("actions", [ActionSpace(), FEW, ActionSpace(turns=1, radii=(math.inf,))], ids=len)
 def test_the_action_space_is_drawn_whole_and_after_one_turn(tmp_path, actions):
-    figure = map_figures.action_figure(actions, SEEKUR_JR, GRID)
+    figure = map_figures.action_figure(Setup(SEEKUR_JR, actions, GRID))
     assert colours(pixels(figure, tmp_path)) > 50
     whole, fan = figure.axes
     radii = len(actions.radii)

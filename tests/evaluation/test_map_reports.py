@@ -9,10 +9,12 @@ from travjax.data.map_batches import MapStream
 from travjax.evaluation.map_reports import label_maps, write_terrain
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.styles import generate_terrain
 
 HUSKY, GRID = Robot.load("husky_a200"), Grid(4, 0.125)
+SETUP = Setup(HUSKY, FEW, GRID)
 
 
 def test_terrain_is_written_with_a_sheet_of_each_style(tmp_path):
@@ -26,7 +28,7 @@ def test_terrain_is_written_with_a_sheet_of_each_style(tmp_path):
 
 def test_labels_are_written_with_all_that_they_depend_on(tmp_path, capsys):
     maps = MapStream.synthetic(["rough"], [3, 4], GRID, 8.0)
-    path = label_maps(maps, HUSKY, FEW, GRID, tmp_path, figures=False)
+    path = label_maps(maps, SETUP, tmp_path, figures=False)
     assert files(tmp_path) == {path, tmp_path / "shares.txt"}
     with np.load(path) as labels:
         margins = simulate(labels["heights"], HUSKY, FEW, grid=GRID)

@@ -21,6 +21,7 @@ from travjax.evaluation.tables import rows_table
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import label, unpacked
 from travjax.terrain.styles import generate_terrain
 
@@ -29,6 +30,7 @@ FRAIL = replace(SEEKUR_JR, max_step=0.02, ride_height=0.04, max_tilt=0.1)
 FEW = ActionSpace(turns=2, arc_lengths=(0.5, 0.6), radii=(math.inf, 1.5, -1.5), interval=0.1)
 FEW_TOML = "turns = 2\narc_lengths = [0.5, 0.6]\nradii = [inf, 1.5, -1.5]\ninterval = 0.1\n"
 GRID = Grid(3.75, 0.125)  # no other test compiles for it: the first call here is the one that compiles
+SETUP = Setup(SEEKUR_JR, FEW, GRID)
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +38,7 @@ def kernels() -> list[dict]:
     """The rows of terrain and labelling for one and for two maps at once."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulator_benchmark, "BATCHES", (1, 2))
-        return list(simulator_benchmark.kernel_rows(SEEKUR_JR, FEW, GRID, repeats=3))
+        return list(simulator_benchmark.kernel_rows(SETUP, repeats=3))
 
 
 def is_whole(row: dict) -> bool:
@@ -92,7 +94,7 @@ def test_a_call_is_timed_until_its_result_is_there(monkeypatch):
 
 def test_the_sequential_simulator_goes_through_every_trajectory_of_one_map():
     done = []
-    row = simulator_benchmark.reference_row(SEEKUR_JR, FEW, GRID, done.append)
+    row = simulator_benchmark.reference_row(SETUP, done.append)
     assert is_whole(row)
     assert row["maps"] == row["repeats"] == 1
     assert row["what"].startswith("sequential")

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
-from tests.small_training import GRID, HUSKY
+from tests.small_training import GRID, HUSKY, SETUP
 from travjax.data.dataset import DatasetConfig
 from travjax.data.provenance import SitesConfig
 from travjax.estimators.names import ESTIMATORS
@@ -55,7 +54,7 @@ def model(tmp_path_factory):
 def sites(tmp_path_factory) -> Path:
     """Two sites, ridge of two windows and plain of one, as a TOML file."""
     folder = tmp_path_factory.mktemp("sites")
-    heights = BenchmarkMaps.synthetic(10, 5, HUSKY, FEW, GRID).heights
+    heights = BenchmarkMaps.synthetic(10, 5, SETUP).heights
     ridge = np.concatenate([heights[8], heights[9][:, 1:]], axis=1)
     ridge[3:5, 40:50] = np.nan
     tables = ["stride = 4.0", "fill_holes = false"]
@@ -103,7 +102,7 @@ def test_everything_that_is_written_is_printed(done):
 def test_the_figures_are_those_of_the_methods(done):
     maps = json.loads((done[0] / "results.json").read_text())["maps"]
     assert list(maps) == list(CORRUPTIONS)
-    test = BenchmarkMaps.synthetic(6, comparison.SEED, HUSKY, FEW, GRID)
+    test = BenchmarkMaps.synthetic(6, comparison.SEED, SETUP)
     for name in ("none", "noise 2 cm", "20% missing"):
         probability = Predictor(RUN, estimator()).predict(test.seen(name, comparison.SEED)).probability
         counts = maps[name]["methods"]["hazard field"]["confusion"]["overall"]
@@ -122,7 +121,7 @@ def test_the_figures_are_those_of_the_methods(done):
 
 def test_the_filter_is_the_best_on_validation_maps(done):
     maps = json.loads((done[0] / "results.json").read_text())["maps"]
-    validation = BenchmarkMaps.synthetic(5, comparison.SEED + 1, HUSKY, FEW, GRID)
+    validation = BenchmarkMaps.synthetic(5, comparison.SEED + 1, SETUP)
     for name in CORRUPTIONS:
         seen = validation.seen(name, comparison.SEED + 1)
         f1 = {key: validation.scores(validation.simulated(of(seen)))[OVERALL].f1 for key, of in FILTERS.items()}
@@ -151,7 +150,7 @@ def test_another_seed_gives_other_maps_and_the_same_one_the_same_results():
     network = Predictor(RUN, estimator())
     found = []
     for seed in (1, 1, 2):
-        test, validation = (BenchmarkMaps.synthetic(5, seed + number, HUSKY, FEW, GRID) for number in (0, 1))
+        test, validation = (BenchmarkMaps.synthetic(5, seed + number, SETUP) for number in (0, 1))
         found.append(compare(test, validation, network, None, 5, best_filters(validation, seed), seed))
     assert found[0] == found[1] != found[2]
 
@@ -192,7 +191,7 @@ def test_the_times_are_of_every_way(done):
 def test_the_figures_of_a_site_are_those_of_its_windows(done, sites):
     results = json.loads((done[0] / "results.json").read_text())
     assert results["windows"] == {"ridge": 2, "plain": 1}
-    real = of_sites(SitesConfig.load(sites), 100, comparison.SEED, HUSKY, FEW, GRID)
+    real = of_sites(SitesConfig.load(sites), 100, comparison.SEED, SETUP)
     for site, ground in real.items():
         known = ground.known
         assert known.all() == (site == "plain")

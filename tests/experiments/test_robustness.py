@@ -5,7 +5,7 @@ import pytest
 
 from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
-from tests.small_training import GRID, HUSKY
+from tests.small_training import GRID, HUSKY, SETUP
 from travjax.data.provenance import Site, SitesConfig
 from travjax.evaluation.metrics import OVERALL
 from travjax.experiments.robustness import (
@@ -24,7 +24,7 @@ from travjax.simulation.traverse import simulate
 
 @pytest.fixture(scope="module")
 def ground() -> BenchmarkMaps:
-    return BenchmarkMaps.synthetic(10, 3, HUSKY, FEW, GRID)
+    return BenchmarkMaps.synthetic(10, 3, SETUP)
 
 
 def test_the_ground_is_that_of_the_simulator(ground):
@@ -75,7 +75,7 @@ def test_samples_of_an_estimator_are_those_of_whole_maps(ground):
 def sites(tmp_path_factory) -> SitesConfig:
     """Windows of synthetic maps as sites: two of one map each with a hole, one of 3 x 2 windows."""
     folder = tmp_path_factory.mktemp("sites")
-    heights = BenchmarkMaps.synthetic(10, 5, HUSKY, FEW, GRID).heights
+    heights = BenchmarkMaps.synthetic(10, 5, SETUP).heights
     small = heights[3].copy()
     small[20:24, 5:25] = np.nan
     large = np.concatenate([np.concatenate([heights[8], heights[9][:, 1:]], axis=1)] * 2)[: 48 + 1]
@@ -87,7 +87,7 @@ def sites(tmp_path_factory) -> SitesConfig:
 
 
 def test_every_window_of_a_site_is_there_once_whatever_it_is_for(sites):
-    grounds = of_sites(sites, 100, 0, HUSKY, FEW, GRID)
+    grounds = of_sites(sites, 100, 0, SETUP)
     assert {site: len(ground.heights) for site, ground in grounds.items()} == {"large": 6, "little": 1}
     with np.load(sites.site[0].file) as file:
         whole = file["heights"]
@@ -98,8 +98,8 @@ def test_every_window_of_a_site_is_there_once_whatever_it_is_for(sites):
 
 
 def test_windows_are_drawn_by_the_seed_and_no_window_twice(sites):
-    every = of_sites(sites, 100, 0, HUSKY, FEW, GRID)["large"].heights
-    few = [of_sites(sites, 3, seed, HUSKY, FEW, GRID)["large"].heights for seed in (0, 0, 1, 2, 3)]
+    every = of_sites(sites, 100, 0, SETUP)["large"].heights
+    few = [of_sites(sites, 3, seed, SETUP)["large"].heights for seed in (0, 0, 1, 2, 3)]
     assert all(len(windows) == 3 for windows in few)
     np.testing.assert_array_equal(few[0], few[1])
     drawn = [tuple(int(np.flatnonzero((every == one).all(axis=(1, 2)))[0]) for one in windows) for windows in few]
@@ -107,7 +107,7 @@ def test_windows_are_drawn_by_the_seed_and_no_window_twice(sites):
 
 
 def test_unknown_ground_counts_in_no_score_and_is_filled_for_the_methods(sites):
-    ground = of_sites(sites, 100, 0, HUSKY, FEW, GRID)["little"]
+    ground = of_sites(sites, 100, 0, SETUP)["little"]
     with np.load(sites.site[1].file) as file:
         heights = file["heights"][None]
     margins = simulate(heights, HUSKY, FEW, grid=GRID)

@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from tests.commandline import FEW, files, run_words
+from tests.commandline import files, run_words
 from tests.conftest import SEEKUR_JR
-from tests.small_training import GRID, GRID_WORDS, HUSKY, PRESET, TOML, copy, loads, rows_of, validations
+from tests.small_training import GRID_WORDS, HUSKY, PRESET, SETUP, TOML, copy, loads, rows_of, validations
 from travjax.evaluation.metrics import Confusion
 from travjax.evaluation.simulator_benchmark import machine
 from travjax.experiments import synthetic
 from travjax.runs.run import Run
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
+from travjax.simulation.setup import Setup
 from travjax.training.trainer import Trainer
 
 pytestmark = pytest.mark.usefixtures("shared_code")
@@ -74,7 +74,7 @@ def done(place, words, shared_code) -> tuple[Path, str]:
 def test_it_trains_and_evaluates_like_the_commands(done, trained, tmp_path):
     folder, _ = done
     assert rows_of(folder) == rows_of(trained)
-    assert Run.load(folder) == Run(PRESET, HUSKY, FEW, GRID)
+    assert Run.load(folder) == Run(PRESET, SETUP)
     code, _, err = run_words("evaluate", trained, "--data", trained.parent / "set", "--out", tmp_path / "out")
     assert code == 0, err
     for name in ("tables.txt", "evaluation.json"):
@@ -131,7 +131,7 @@ def line_of(run: Run, confusion: Confusion) -> list[str]:
 
 
 def test_the_paper_s_figures_stand_beside_ours():
-    as_in_paper = Run(PRESET, SEEKUR_JR, ActionSpace(), Grid())
+    as_in_paper = Run(PRESET, Setup(SEEKUR_JR))
     (line,) = line_of(as_in_paper, Confusion(tn=75, fp=10, fn=5, tp=15))
     assert "recall 0.750 (0.944), precision 0.600 (0.684), F1 0.667 (0.793)" in line
     (line,) = line_of(as_in_paper, Confusion(tn=100, fp=0, fn=0, tp=0))
@@ -141,9 +141,9 @@ def test_the_paper_s_figures_stand_beside_ours():
 @pytest.mark.parametrize(
     "run",
     [
-        Run(PRESET, HUSKY, ActionSpace(), Grid()),
-        Run(PRESET, replace(SEEKUR_JR, max_step=0.1), ActionSpace(), Grid()),
-        Run(PRESET, SEEKUR_JR, ActionSpace(radii=(math.inf, 1.5, -1.5)), Grid()),
+        Run(PRESET, Setup(HUSKY)),
+        Run(PRESET, Setup(replace(SEEKUR_JR, max_step=0.1))),
+        Run(PRESET, Setup(SEEKUR_JR, ActionSpace(radii=(math.inf, 1.5, -1.5)))),
     ],
 )
 def test_the_paper_s_figures_are_left_out_where_they_do_not_compare(run):

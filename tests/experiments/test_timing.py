@@ -20,6 +20,7 @@ from travjax.experiments import timing
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
+from travjax.simulation.setup import Setup
 from travjax.training import network_benchmark
 
 GRID_WORDS = ("--size", 4, "--spacing", 0.125)
@@ -116,16 +117,16 @@ def test_times_are_those_of_the_benchmarks_and_fit_together(monkeypatch):
     """4 s in sequence, 0.5 s one map, 0.1 s a map of 32, 2 s by the network."""
     asked = []
 
-    def reference_row(robot, actions, grid, on_progress, repeats):
+    def reference_row(setup, on_progress, repeats):
         asked.append(("sequential", repeats))
         return {"ms_per_map": 4000.0}
 
-    def labelling_row(maps, robot, actions, grid, repeats):
+    def labelling_row(maps, setup, repeats):
         asked.append((maps, repeats))
         return {"ms_per_map": {1: 500.0, 32: 100.0}[maps]}
 
     class Network:
-        def __init__(self, robot, actions, grid, repeats, trunk):
+        def __init__(self, setup, repeats, trunk):
             asked.append(trunk)
 
         def all_trajectories(self, batch, repeats):
@@ -136,7 +137,7 @@ def test_times_are_those_of_the_benchmarks_and_fit_together(monkeypatch):
     monkeypatch.setattr(simulator_benchmark, "labelling_row", labelling_row)
     monkeypatch.setattr(timing, "Bench", Network)
     monkeypatch.setattr(timing, "_device", lambda: "NVIDIA H100")
-    rows = timing.measured(HUSKY, FEW, Grid(4, 0.125), ResNetConfig((2,), 8), batch=64, repeats=7)
+    rows = timing.measured(Setup(HUSKY, FEW, Grid(4, 0.125)), ResNetConfig((2,), 8), batch=64, repeats=7)
     assert asked == [("sequential", 7), (1, 7), (32, 7), ResNetConfig((2,), 8), (64, 7)]
     assert [row["seconds"] for row in rows] == [4.0, 0.5, 0.1, 2.0]
     assert [row["speed_up"] for row in rows] == [1, 8, 40, 2]
@@ -202,7 +203,7 @@ def test_several_devices_are_counted(monkeypatch):
 def test_the_sequential_simulator_s_time_is_the_median_of_its_calls(monkeypatch):
     ticks, done = iter([0, 5, 10, 11, 20, 23]), []
     monkeypatch.setattr(simulator_benchmark.time, "perf_counter", lambda: next(ticks))
-    row = simulator_benchmark.reference_row(SEEKUR_JR, FEW, Grid(4, 0.125), done.append, repeats=3)
+    row = simulator_benchmark.reference_row(Setup(SEEKUR_JR, FEW, Grid(4, 0.125)), done.append, repeats=3)
     assert row["ms_per_map"] == 3000 and row["repeats"] == 3
     assert done == [*range(1, 19)] * 3
 

@@ -129,7 +129,7 @@ def test_a_second_call_trains_nothing_and_gives_the_same_results(whole, monkeypa
 
 def test_a_model_and_a_data_set_may_be_given(whole, preset, trained, tmp_path):
     given = Run.load(trained)
-    data = sites.read(SitesConfig.load(preset.parent / "sites.toml"), given.robot, given.actions, given.grid)
+    data = sites.read(SitesConfig.load(preset.parent / "sites.toml"), given.setup)
     save(data, tmp_path / "data")
     code, printed, err = run(preset, "--synthetic", trained, "--data", tmp_path / "data", "--out", tmp_path / "out")
     assert code == 0, err
@@ -208,7 +208,7 @@ def test_an_experiment_of_old_keys_goes_on_with_a_notice(tmp_path, capsys):
 
 def test_a_data_set_for_another_robot_is_refused_with_both_named(preset, trained, tmp_path):
     given, leo = Run.load(trained), Robot.load("leo_rover")
-    save(sites.read(SitesConfig.load(preset.parent / "sites.toml"), leo, given.actions, given.grid), tmp_path / "data")
+    save(sites.read(SitesConfig.load(preset.parent / "sites.toml"), replace(given.setup, robot=leo)), tmp_path / "data")
     message = refused(preset, "--synthetic", trained, "--data", tmp_path / "data", "--out", tmp_path / "out")
     assert "Leo Rover" in message and given.robot.name in message
 

@@ -238,7 +238,7 @@ def refusal(*arguments) -> str:
 
 
 def test_a_data_set_for_another_robot_is_refused_with_both_named(trained, real, tmp_path):
-    other = replace(real, robot=Robot.load("leo_rover"))
+    other = replace(real, setup=replace(real.setup, robot=Robot.load("leo_rover")))
     message = refusal(FROZEN, Run.load(trained), trained, other, tmp_path, Devices.all())
     assert "Leo Rover" in message and HUSKY.name in message
 

@@ -35,6 +35,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import PRESETS as ROBOTS
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.training.trainer import Position
 
 from .worker import Format, Invalid
@@ -227,7 +228,7 @@ def _set(folder: Path, provenance: Provenance | None) -> None:
     group = np.full(10, "hill") if provenance else config.styles()
     arrays = (maps, labels, group, config.seeds(), config.splits())
     given = None if provenance else config
-    save(Dataset(*arrays, RUN.robot, RUN.actions, GRID, given, provenance=provenance), folder / "set")
+    save(Dataset(*arrays, Setup(RUN.robot, RUN.actions, GRID), given, provenance=provenance), folder / "set")
 
 
 def _provenance() -> Provenance:

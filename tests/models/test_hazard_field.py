@@ -11,14 +11,14 @@ import pytest
 from tests.commandline import FEW
 from tests.conftest import SEEKUR_JR
 from tests.field_runs import CONFIG, estimator, forward, random_variables
-from tests.small_training import GRID, HUSKY, dataset
+from tests.small_training import SETUP, dataset
 from travjax.config import InputError
 from travjax.estimators.map_samples import MapSource, relative
 from travjax.models.hazard_field import FieldConfig, HazardField, create, read_out
 from travjax.models.pose_stencil import Stencil, nodes_at, stencil
 from travjax.models.variables import merge_model, split_model
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
+from travjax.simulation.setup import Setup
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -32,7 +32,7 @@ def trunk(field: HazardField, elevation):
 
 
 def test_the_read_out_is_a_loop_over_the_poses_of_each_trajectory():
-    table, actions, rng = stencil(SEEKUR_JR, ActionSpace(), Grid()), ActionSpace(), np.random.default_rng(0)
+    table, actions, rng = stencil(Setup(SEEKUR_JR)), ActionSpace(), np.random.default_rng(0)
     arcs, poses = table.nodes.shape[:2]
     hazard = rng.normal(-3, 2, (arcs, poses, 2, 6)).astype(np.float32)
     logits, margins = map(np.asarray, read_out(jnp.asarray(hazard), table))
@@ -55,7 +55,7 @@ def test_the_read_out_is_a_loop_over_the_poses_of_each_trajectory():
 def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
     """The whole network against the channels of its U-Net, read by hand at the poses of `actions.poses`."""
     made, heights = estimator(), dataset().heights[:2]
-    source = MapSource.from_maps(heights, HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(heights, SETUP, 0.1)
     elevation = source.elevation(np.arange(2))
     logits, margins = map(np.asarray, forward(made, elevation, source.stencil))
     channels = np.asarray(trunk(made, elevation), np.float64).reshape(2, -1, CONFIG.channels)
@@ -67,7 +67,7 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
         _, one, two = FEW.split(trajectory)
         poses, own = FEW.poses(trajectory), len(FEW.first_stations())
         radius = np.where(np.arange(len(poses)) < own, FEW.radii[one], FEW.radii[two])
-        nodes = nodes_at(poses, radius, HUSKY, FEW, GRID)
+        nodes = nodes_at(poses, radius, SETUP)
         for index in range(2):
             ground = channels[index][nodes]
             mean = ground.mean(axis=1, keepdims=True)
@@ -80,7 +80,7 @@ def test_a_trajectory_is_read_at_its_own_poses_on_the_map():
 
 
 def test_a_map_is_seen_the_same_in_any_batch():
-    source = MapSource.from_maps(dataset().heights, HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights, SETUP, 0.1)
     together = forward(estimator(), source.elevation(np.arange(5)), source.stencil)
     for index in (0, 3):
         alone = forward(estimator(), source.elevation(np.array([index])), source.stencil)
@@ -89,13 +89,13 @@ def test_a_map_is_seen_the_same_in_any_batch():
 
 
 def test_the_height_of_the_map_plays_no_part():
-    source, raised = (MapSource.from_maps(dataset().heights[:1] + up, HUSKY, FEW, GRID, 0.1) for up in (0, 64))
+    source, raised = (MapSource.from_maps(dataset().heights[:1] + up, SETUP, 0.1) for up in (0, 64))
     low, high = (forward(estimator(), one.elevation(np.array([0])), one.stencil)[0] for one in (source, raised))
     np.testing.assert_allclose(low, high, atol=1e-3)
 
 
 def test_trajectories_of_a_few_first_arcs_are_those_of_all():
-    source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:1], SETUP, 0.1)
     table, elevation = source.stencil, source.elevation(np.array([0]))
     whole = forward(estimator(), elevation, table)[0].reshape(-1, table.second_arcs, 3)
     some = np.array([1, 4])
@@ -106,7 +106,7 @@ def test_trajectories_of_a_few_first_arcs_are_those_of_all():
 def test_an_unknown_node_is_seen_as_the_nearest_known_one():
     heights = dataset().heights[:1].copy()
     heights[0, 5, 7] = np.nan
-    seen = MapSource.from_maps(heights, HUSKY, FEW, GRID, 0.1).heights
+    seen = MapSource.from_maps(heights, SETUP, 0.1).heights
     assert np.isfinite(seen).all() and seen[0, 5, 7] in heights[0, 4:7, 6:9]
 
 
@@ -120,7 +120,7 @@ def test_maps_may_have_any_number_of_nodes(nodes):
 
 def test_gradients_reach_every_parameter():
     graph, variables = random_variables()
-    source = MapSource.from_maps(dataset().heights[:3], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:3], SETUP, 0.1)
     elevation = source.elevation(np.arange(3))
     weights = np.random.default_rng(0).normal(size=(2, 3, len(FEW), 3)).astype(np.float32)
 
@@ -137,7 +137,7 @@ def test_gradients_reach_every_parameter():
 
 def test_activations_may_be_bfloat16():
     config = FieldConfig(stem=4, widths=(4, 8), channels=3, hidden=8, dtype="bfloat16")
-    source = MapSource.from_maps(dataset().heights[:1], HUSKY, FEW, GRID, 0.1)
+    source = MapSource.from_maps(dataset().heights[:1], SETUP, 0.1)
     found = [forward(create(c), source.elevation(np.array([0])), source.stencil)[0] for c in (config, CONFIG)]
     assert found[0].dtype == jnp.float32
     np.testing.assert_allclose(*found, atol=0.2)

@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from tests.conftest import CELL, HUSKY, SEEKUR_JR, SETTINGS, Setting
+from tests.conftest import CELL, HUSKY, SEEKUR_JR, SETUPS
 from travjax.config import InputError
 from travjax.models import input_images
 from travjax.models.input_images import assemble, elevation_channel, render_inputs, trajectory_bank, trajectory_channels
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 PAPER = ActionSpace()
 LEVEL = 1 / 255
@@ -27,7 +28,7 @@ TOLERANCE = LEVEL / 2 + 3e-4
 STEP = 2.5e-4
 """Metres of path between the points of the float64 rendering; between them paths are taken as straight."""
 
-SMALL = Setting(HUSKY, ActionSpace(turns=4, radii=(math.inf, 0.7, -0.7), arc_lengths=(0.6, 0.5)), Grid(4, 0.125))
+SMALL = Setup(HUSKY, ActionSpace(turns=4, radii=(math.inf, 0.7, -0.7), arc_lengths=(0.6, 0.5)), Grid(4, 0.125))
 """36 trajectories on maps of 33 x 33 nodes."""
 
 ON_NODES = replace(SEEKUR_JR, track=10 * CELL, wheelbase=6 * CELL, wheel_width=3 * CELL, chassis_width=7 * CELL)
@@ -37,18 +38,18 @@ CLOSE_TO_HALF_THE_TRACK = (SEEKUR_JR.track / 2, -SEEKUR_JR.track / 2, SEEKUR_JR.
 SHORT = replace(SEEKUR_JR, wheelbase=0.01)
 """Its inner wheels turn on the spot where the radius is half the track."""
 
-TURNING_SETTINGS = {
-    "more than half a circle": Setting(SEEKUR_JR, ActionSpace(turns=2, radii=(0.5, -0.5, 0.9), interval=0.1)),
-    "more than a full circle": Setting(
+TURNING_SETUPS = {
+    "more than half a circle": Setup(SEEKUR_JR, ActionSpace(turns=2, radii=(0.5, -0.5, 0.9), interval=0.1)),
+    "more than a full circle": Setup(
         SEEKUR_JR, ActionSpace(turns=3, radii=(math.inf, 0.4, -0.4), arc_lengths=(2.6, 3.0), interval=0.1)
     ),
-    "half the track": Setting(SEEKUR_JR, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
-    "wheels on the spot": Setting(SHORT, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
-    "wide wheels": Setting(
+    "half the track": Setup(SEEKUR_JR, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
+    "wheels on the spot": Setup(SHORT, ActionSpace(turns=2, radii=CLOSE_TO_HALF_THE_TRACK, interval=0.1)),
+    "wide wheels": Setup(
         replace(HUSKY, wheel_width=0.7, ride_height=0.4), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)
     ),
-    "thin wheels": Setting(replace(HUSKY, wheel_width=0.01), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)),
-    "an odd number of cells": Setting(HUSKY, ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1), Grid(7.8, 0.2)),
+    "thin wheels": Setup(replace(HUSKY, wheel_width=0.01), ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1)),
+    "an odd number of cells": Setup(HUSKY, ActionSpace(turns=3, radii=(1.0, -1.5), interval=0.1), Grid(7.8, 0.2)),
 }
 
 
@@ -123,17 +124,17 @@ def relative_elevation(heights: np.ndarray, scale: float) -> np.ndarray:
     return np.nan_to_num(np.clip((heights - heights[rows[nearest], cols[nearest]]) / scale, -4, 4))
 
 
-def assert_rendered(images, setting: Setting, trajectories):
-    assert images.shape == (len(trajectories), *setting.grid.shape, 2)
+def assert_rendered(images, setup: Setup, trajectories):
+    assert images.shape == (len(trajectories), *setup.grid.shape, 2)
     assert images.dtype == np.uint8
     for image, trajectory in zip(np.asarray(images), trajectories, strict=True):
-        expected = rendered(*setting, int(trajectory))
+        expected = rendered(setup, int(trajectory))
         np.testing.assert_allclose(image / 255, expected, rtol=0, atol=TOLERANCE, err_msg=f"trajectory {trajectory}")
 
 
-def channels(setting: Setting, trajectories) -> np.ndarray:
+def channels(setup: Setup, trajectories) -> np.ndarray:
     """Channels 2 and 3 of trajectories as travjax draws them, uint8."""
-    return np.asarray(trajectory_channels(*setting, np.asarray(trajectories)))
+    return np.asarray(trajectory_channels(setup, np.asarray(trajectories)))
 
 
 def some_of(actions: ActionSpace, count: int, seed: int = 0) -> np.ndarray:
@@ -156,33 +157,33 @@ def test_the_float64_rendering_knows_straight_lines_and_circles():
 
 def test_random_trajectories_of_the_paper_are_as_rendered():
     sample = some_of(PAPER, 36)
-    assert_rendered(channels(SETTINGS["paper"], sample), SETTINGS["paper"], sample)
+    assert_rendered(channels(SETUPS["paper"], sample), SETUPS["paper"], sample)
 
 
 def test_straight_tightest_widest_and_s_shaped_trajectories_are_as_rendered():
     arcs = [(0, 0), (1, 1), (2, 2), (1, 2), (2, 1), (11, 12), (0, 1), (2, 0), (5, 8)]
     sample = [PAPER.index(turn, *pair) for turn, pair in zip((0, 0, 4, 0, 13, 9, 17, 2, 6), arcs, strict=True)]
-    assert_rendered(channels(SETTINGS["paper"], sample), SETTINGS["paper"], sample)
+    assert_rendered(channels(SETUPS["paper"], sample), SETUPS["paper"], sample)
 
 
-def test_trajectories_of_other_settings_are_as_rendered(setting):
-    sample = some_of(setting.actions, 4)
-    assert_rendered(channels(setting, sample), setting, sample)
+def test_trajectories_of_other_setups_are_as_rendered(setup):
+    sample = some_of(setup.actions, 4)
+    assert_rendered(channels(setup, sample), setup, sample)
 
 
-@pytest.mark.parametrize("name", TURNING_SETTINGS)
+@pytest.mark.parametrize("name", TURNING_SETUPS)
 def test_trajectories_that_turn_far_are_as_rendered(name):
-    setting = TURNING_SETTINGS[name]
-    sample = some_of(setting.actions, 6)
-    assert_rendered(channels(setting, sample), setting, sample)
+    setup = TURNING_SETUPS[name]
+    sample = some_of(setup.actions, 6)
+    assert_rendered(channels(setup, sample), setup, sample)
 
 
 def test_trajectories_that_hardly_turn_are_as_rendered():
     """The centres of their circles lie far off the map, where float32 sees little."""
     radii = (math.inf, 30.0, -300.0, 1e3, -2e3, 1e4, -1e6)
-    setting = Setting(SEEKUR_JR, ActionSpace(turns=3, radii=radii, interval=0.1))
-    sample = setting.actions.index(np.arange(7) % 3, np.arange(7), np.arange(7)[::-1])
-    assert_rendered(channels(setting, sample), setting, sample)
+    setup = Setup(SEEKUR_JR, ActionSpace(turns=3, radii=radii, interval=0.1))
+    sample = setup.actions.index(np.arange(7) % 3, np.arange(7), np.arange(7)[::-1])
+    assert_rendered(channels(setup, sample), setup, sample)
 
 
 lengths = st.floats(0.2, 2.5)
@@ -203,8 +204,8 @@ def test_any_robot_and_arcs_are_as_rendered(track, wheelbase, wheel_width, arc_l
     above = {"ride_height": 1.0}  # so that wheels of any track stand below the chassis
     robot = replace(SEEKUR_JR, track=track, wheelbase=wheelbase, wheel_width=wheel_width, **above)
     actions = ActionSpace(turns=7, radii=(math.inf, radius, -radius), arc_lengths=arc_lengths, interval=0.1)
-    setting, sample = Setting(robot, actions, Grid(8, 0.125)), [actions.index(turn, *arcs)]
-    assert_rendered(channels(setting, sample), setting, sample)
+    setup, sample = Setup(robot, actions, Grid(8, 0.125)), [actions.index(turn, *arcs)]
+    assert_rendered(channels(setup, sample), setup, sample)
 
 
 # Images whose look is known
@@ -223,14 +224,14 @@ def test_a_straight_trajectory_has_a_closed_form():
         np.maximum(along(-half_track, forward, half_width), along(half_track, forward, half_width))
         for forward in (half_base, -half_base)
     ]
-    image = channels(Setting(ON_NODES, PAPER), [0])[0] / 255
+    image = channels(Setup(ON_NODES, PAPER), [0])[0] / 255
     np.testing.assert_allclose(image[..., 0], along(0, 0, half_track), rtol=0, atol=LEVEL / 2 + 1e-5)
     np.testing.assert_allclose(image[..., 1], (axles[0] + axles[1]) / 2, rtol=0, atol=LEVEL / 2 + 1e-5)
 
 
 def test_wheels_are_1_where_a_front_and_a_rear_wheel_pass_and_half_where_one_does():
     """Straight on along columns of nodes: the rear wheels start, and the front wheels end, a wheelbase apart."""
-    wheels = channels(Setting(ON_NODES, PAPER), [0])[0, ..., 1]
+    wheels = channels(Setup(ON_NODES, PAPER), [0])[0, ..., 1]
     y = Grid().axis()
     half_base, length = ON_NODES.wheelbase / 2, sum(PAPER.arc_lengths)
     both = (y >= half_base) & (y <= length - half_base)
@@ -248,7 +249,7 @@ def test_wheels_are_1_where_a_front_and_a_rear_wheel_pass_and_half_where_one_doe
 @pytest.mark.parametrize("arcs", [(1, 2), (3, 0), (2, 2)])
 def test_wheels_are_above_half_only_where_a_front_and_a_rear_wheel_pass(arcs):
     trajectory = PAPER.index(5, *arcs)
-    wheels = channels(SETTINGS["paper"], [trajectory])[0, ..., 1] / 255
+    wheels = channels(SETUPS["paper"], [trajectory])[0, ..., 1] / 255
     front, rear = wheel_distances(SEEKUR_JR, PAPER, Grid(), trajectory).min(axis=1)
     both, either = np.isfinite(front) & np.isfinite(rear), np.isfinite(front) | np.isfinite(rear)
     assert (wheels > 0.5 + LEVEL).sum() > 40
@@ -260,7 +261,7 @@ def test_wheels_are_above_half_only_where_a_front_and_a_rear_wheel_pass(arcs):
 @pytest.mark.parametrize("arcs", [(0, 0), (1, 1), (2, 9)])
 def test_the_trajectory_is_0_from_the_wheel_track_outwards_and_above_0_within(arcs):
     trajectory = PAPER.index(7, *arcs)
-    image = channels(SETTINGS["paper"], [trajectory])[0, ..., 0]
+    image = channels(SETUPS["paper"], [trajectory])[0, ..., 0]
     half_track = SEEKUR_JR.track / 2
     away = distance(path(0, PAPER, trajectory), nodes_of(Grid()), 1.0)
     assert not image[away >= half_track].any()
@@ -269,7 +270,7 @@ def test_the_trajectory_is_0_from_the_wheel_track_outwards_and_above_0_within(ar
 
 
 def test_the_robot_itself_is_on_the_path():
-    centres = channels(SETTINGS["paper"], some_of(PAPER, 40, seed=1))[:, 64, 64, 0]
+    centres = channels(SETUPS["paper"], some_of(PAPER, 40, seed=1))[:, 64, 64, 0]
     np.testing.assert_array_equal(centres, 255)
 
 
@@ -282,41 +283,41 @@ def assert_same_images(images, expected):
 def test_opposite_radii_mirror_the_image():
     opposite = np.array([0, 2, 1, 4, 3, 6, 5, 8, 7, 10, 9, 12, 11])
     first, second = np.divmod(some_of(replace(PAPER, turns=1), 40), 13)
-    images = channels(SETTINGS["paper"], PAPER.index(0, first, second))
-    mirrored = channels(SETTINGS["paper"], PAPER.index(0, opposite[first], opposite[second]))
+    images = channels(SETUPS["paper"], PAPER.index(0, first, second))
+    mirrored = channels(SETUPS["paper"], PAPER.index(0, opposite[first], opposite[second]))
     assert_same_images(mirrored, images[:, :, ::-1])
     assert (mirrored != images).any()
 
 
 def test_half_a_turn_more_turns_the_image_by_180_degrees():
     turn, first, second = PAPER.split(some_of(PAPER, 40))
-    images = channels(SETTINGS["paper"], PAPER.index(turn, first, second))
-    turned = channels(SETTINGS["paper"], PAPER.index((turn + 9) % 18, first, second))
+    images = channels(SETUPS["paper"], PAPER.index(turn, first, second))
+    turned = channels(SETUPS["paper"], PAPER.index((turn + 9) % 18, first, second))
     assert_same_images(turned, images[:, ::-1, ::-1])
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
 def test_a_point_turn_turns_the_image_and_leaves_no_trace(turn):
     """Rows run north, so quarter turns anticlockwise are clockwise ones for NumPy."""
-    setting = Setting(SEEKUR_JR, ActionSpace(turns=4, radii=(math.inf, 1.2, -1.2)))
+    setup = Setup(SEEKUR_JR, ActionSpace(turns=4, radii=(math.inf, 1.2, -1.2)))
     first, second = np.divmod(np.arange(9), 3)
-    ahead = channels(setting, setting.actions.index(0, first, second))
-    turned = channels(setting, setting.actions.index(turn, first, second))
+    ahead = channels(setup, setup.actions.index(0, first, second))
+    turned = channels(setup, setup.actions.index(turn, first, second))
     assert_same_images(turned, np.rot90(ahead, -turn, axes=(1, 2)))
 
 
 def test_a_trajectory_looks_the_same_in_any_batch():
     sample = some_of(PAPER, 7)
-    images = channels(SETTINGS["paper"], sample)
+    images = channels(SETUPS["paper"], sample)
     for index in range(7):
-        np.testing.assert_array_equal(channels(SETTINGS["paper"], sample[index : index + 1])[0], images[index])
-    np.testing.assert_array_equal(channels(SETTINGS["paper"], sample[::-1]), images[::-1])
+        np.testing.assert_array_equal(channels(SETUPS["paper"], sample[index : index + 1])[0], images[index])
+    np.testing.assert_array_equal(channels(SETUPS["paper"], sample[::-1]), images[::-1])
 
 
 def test_trajectories_that_are_none_are_refused():
     for trajectory in (-1, len(SMALL.actions)):
         with pytest.raises(InputError, match=f"^trajectory = .*: must be from 0 to {len(SMALL.actions) - 1}$"):
-            trajectory_channels(*SMALL, np.array([0, trajectory]))
+            trajectory_channels(SMALL, np.array([0, trajectory]))
 
 
 # The bank
@@ -324,7 +325,7 @@ def test_trajectories_that_are_none_are_refused():
 
 @pytest.fixture(scope="module")
 def bank(tmp_path_factory) -> np.ndarray:
-    return trajectory_bank(*SMALL, cache=tmp_path_factory.mktemp("bank"))
+    return trajectory_bank(SMALL, cache=tmp_path_factory.mktemp("bank"))
 
 
 def listing(folder) -> list[str]:
@@ -348,10 +349,10 @@ def test_the_bank_holds_every_trajectory_in_order(bank):
 
 
 def test_the_bank_is_kept_on_disk_and_used_again(tmp_path, bank):
-    first = trajectory_bank(*SMALL, cache=tmp_path)
+    first = trajectory_bank(SMALL, cache=tmp_path)
     file = only_file(tmp_path)
     before = identity(file)
-    again = trajectory_bank(*SMALL, cache=tmp_path)
+    again = trajectory_bank(SMALL, cache=tmp_path)
     np.testing.assert_array_equal(first, bank)
     np.testing.assert_array_equal(again, bank)
     assert again.dtype == np.uint8
@@ -359,37 +360,37 @@ def test_the_bank_is_kept_on_disk_and_used_again(tmp_path, bank):
 
 
 def test_a_kept_bank_is_not_drawn_anew(tmp_path, bank, monkeypatch):
-    trajectory_bank(*SMALL, cache=tmp_path)
+    trajectory_bank(SMALL, cache=tmp_path)
     monkeypatch.setattr(input_images, "trajectory_channels", None)
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path), bank)
 
 
 def test_a_missing_cache_folder_is_made(tmp_path, bank):
     folder = tmp_path / "some" / "where"
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=folder), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=folder), bank)
     assert len(listing(folder)) == 1
 
 
 @pytest.mark.parametrize(
     "other",
     [
-        SMALL._replace(robot=replace(HUSKY, wheel_width=0.13)),
-        SMALL._replace(robot=replace(HUSKY, track=0.6)),
-        SMALL._replace(robot=replace(HUSKY, wheelbase=0.6)),
-        SMALL._replace(actions=replace(SMALL.actions, radii=(math.inf, -0.7, 0.7))),
-        SMALL._replace(actions=replace(SMALL.actions, arc_lengths=(0.5, 0.6))),
-        SMALL._replace(grid=Grid(4.8, 0.15)),
+        replace(SMALL, robot=replace(HUSKY, wheel_width=0.13)),
+        replace(SMALL, robot=replace(HUSKY, track=0.6)),
+        replace(SMALL, robot=replace(HUSKY, wheelbase=0.6)),
+        replace(SMALL, actions=replace(SMALL.actions, radii=(math.inf, -0.7, 0.7))),
+        replace(SMALL, actions=replace(SMALL.actions, arc_lengths=(0.5, 0.6))),
+        replace(SMALL, grid=Grid(4.8, 0.15)),
     ],
     ids=["wheel width", "track", "wheelbase", "radii", "arc lengths", "grid"],
 )
 def test_each_configuration_has_a_bank_of_its_own(tmp_path, bank, other):
     """Even one of the same shape."""
-    trajectory_bank(*SMALL, cache=tmp_path)
-    kept = trajectory_bank(*other, cache=tmp_path)
+    trajectory_bank(SMALL, cache=tmp_path)
+    kept = trajectory_bank(other, cache=tmp_path)
     assert kept.shape == bank.shape
     assert (kept != bank).any()
     np.testing.assert_array_equal(kept, channels(other, np.arange(36)))
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path), bank)
 
 
 def half(data: bytes) -> bytes:
@@ -416,30 +417,30 @@ def text(data: bytes) -> bytes:
 
 @pytest.mark.parametrize("damaged", [half, without_end, with_another_byte, nothing, text])
 def test_a_damaged_bank_is_made_anew(tmp_path, bank, damaged):
-    trajectory_bank(*SMALL, cache=tmp_path)
+    trajectory_bank(SMALL, cache=tmp_path)
     file = only_file(tmp_path)
     whole = file.read_bytes()
     file.write_bytes(damaged(whole))
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path), bank)
     assert only_file(tmp_path) == file
     assert file.read_bytes() == whole
 
 
 def test_a_bank_of_another_configuration_under_its_name_is_made_anew(tmp_path, bank):
-    other = SMALL._replace(robot=replace(HUSKY, wheel_width=0.13))
-    trajectory_bank(*SMALL, cache=tmp_path / "own")
-    trajectory_bank(*other, cache=tmp_path / "other")
+    other = replace(SMALL, robot=replace(HUSKY, wheel_width=0.13))
+    trajectory_bank(SMALL, cache=tmp_path / "own")
+    trajectory_bank(other, cache=tmp_path / "other")
     file = only_file(tmp_path / "own")
     file.write_bytes(only_file(tmp_path / "other").read_bytes())
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path / "own"), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path / "own"), bank)
 
 
 def test_an_array_of_another_kind_under_its_name_is_made_anew(tmp_path, bank):
-    trajectory_bank(*SMALL, cache=tmp_path)
+    trajectory_bank(SMALL, cache=tmp_path)
     file = only_file(tmp_path)
     with file.open("wb") as opened:
         np.save(opened, np.zeros((3, 4), np.float32))
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path), bank)
 
 
 @pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
@@ -448,37 +449,37 @@ def test_an_interrupted_bank_leaves_no_file(tmp_path, error):
         raise error
 
     with pytest.raises(error):
-        trajectory_bank(*SMALL, cache=tmp_path, on_progress=interrupted)
+        trajectory_bank(SMALL, cache=tmp_path, on_progress=interrupted)
     assert listing(tmp_path) == []
 
 
 def test_a_cache_that_cannot_be_written_is_done_without(tmp_path, bank):
     (tmp_path / "file").touch()
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=folder), bank)
+        np.testing.assert_array_equal(trajectory_bank(SMALL, cache=folder), bank)
     assert listing(tmp_path) == ["file"]
 
 
 def test_the_bank_is_kept_in_the_users_cache_unless_told_otherwise(tmp_path, bank, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    np.testing.assert_array_equal(trajectory_bank(*SMALL), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL), bank)
     assert only_file(tmp_path).is_relative_to(tmp_path / "travjax")
 
 
 def test_progress_counts_all_trajectories_drawn_or_read(tmp_path):
     for _ in range(2):
         counts = []
-        trajectory_bank(*SMALL, cache=tmp_path, on_progress=counts.append)
+        trajectory_bank(SMALL, cache=tmp_path, on_progress=counts.append)
         assert sum(counts) == 36
 
 
 def test_a_kept_bank_cannot_be_changed_by_its_user(tmp_path, bank):
     """One user's change would be in the images of the next."""
     for _ in range(2):
-        mine = trajectory_bank(*SMALL, cache=tmp_path)
+        mine = trajectory_bank(SMALL, cache=tmp_path)
         if mine.flags.writeable:
             mine[:] = 0
-    np.testing.assert_array_equal(trajectory_bank(*SMALL, cache=tmp_path), bank)
+    np.testing.assert_array_equal(trajectory_bank(SMALL, cache=tmp_path), bank)
 
 
 # Channel 1
@@ -592,7 +593,7 @@ def test_elevation_can_be_traced():
 
 @pytest.fixture(scope="module")
 def small_maps() -> np.ndarray:
-    """Four maps of the small setting, the last with holes and an unknown centre."""
+    """Four maps of the small setup, the last with holes and an unknown centre."""
     return np.stack([*(rolling(SMALL.grid, seed) for seed in range(3)), holed(SMALL.grid)])
 
 
@@ -600,17 +601,17 @@ MAP_INDEX = np.array([2, 0, 3, 3, 1])
 TRAJECTORY_INDEX = np.array([0, 35, 7, 20, 35])
 
 
-def expected_images(heights, setting: Setting, map_index, trajectory_index, scale=1.0) -> np.ndarray:
+def expected_images(heights, setup: Setup, map_index, trajectory_index, scale=1.0) -> np.ndarray:
     return np.stack(
         [
-            np.concatenate([relative_elevation(heights[m], scale)[..., None], rendered(*setting, int(t))], axis=-1)
+            np.concatenate([relative_elevation(heights[m], scale)[..., None], rendered(setup, int(t))], axis=-1)
             for m, t in zip(map_index, trajectory_index, strict=True)
         ]
     )
 
 
 def small_images(heights, map_index=MAP_INDEX, trajectory_index=TRAJECTORY_INDEX, **options) -> np.ndarray:
-    robot, actions, grid = SMALL
+    robot, actions, grid = SMALL.robot, SMALL.actions, SMALL.grid
     return np.asarray(render_inputs(heights, map_index, trajectory_index, robot, actions, grid=grid, **options))
 
 
@@ -621,7 +622,7 @@ def test_images_of_the_paper_are_as_defined():
     assert isinstance(images, jax.Array)
     assert images.shape == (3, 129, 129, 3)
     assert images.dtype == jnp.float32
-    expected = expected_images(heights, SETTINGS["paper"], map_index, trajectory_index)
+    expected = expected_images(heights, SETUPS["paper"], map_index, trajectory_index)
     np.testing.assert_allclose(images[..., 0], expected[..., 0], rtol=0, atol=1e-5)
     np.testing.assert_allclose(images[..., 1:], expected[..., 1:], rtol=0, atol=TOLERANCE)
 
@@ -632,12 +633,12 @@ def test_images_of_a_gpu_are_as_defined():
     map_index, trajectory_index = np.array([0, 1, 1]), some_of(PAPER, 3)
     images = render_inputs(heights, map_index, trajectory_index)
     assert images.devices() <= set(jax.devices("gpu"))
-    expected = expected_images(heights, SETTINGS["paper"], map_index, trajectory_index)
+    expected = expected_images(heights, SETUPS["paper"], map_index, trajectory_index)
     np.testing.assert_allclose(images, expected, rtol=0, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.4])
-def test_images_of_another_setting_are_as_defined(small_maps, scale):
+def test_images_of_another_setup_are_as_defined(small_maps, scale):
     images = small_images(small_maps, elevation_scale=scale)
     expected = expected_images(small_maps, SMALL, MAP_INDEX, TRAJECTORY_INDEX, scale)
     np.testing.assert_allclose(images, expected, rtol=0, atol=TOLERANCE)
@@ -653,7 +654,7 @@ def test_values_are_in_their_ranges():
 
 def test_rows_run_north_and_columns_east():
     """Straight on runs up the middle column, and a hill in the north-east is in the last row and column."""
-    robot, actions, grid = SMALL
+    actions, grid = SMALL.actions, SMALL.grid
     heights = np.zeros(grid.shape)
     heights[-1, -1] = 2
     image = small_images(heights, 0, 0)

@@ -1,14 +1,14 @@
 """Stencils of poses against a loop over poses and places, and against the nodes of the simulator's wheels."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.config import InputError
 from travjax.models.pose_stencil import ALONG, STENCIL_NODES, nodes_at, stencil
-from travjax.simulation.footprint import node_table
 
 
 def places_by_hand(pose, radius, robot, actions) -> list[tuple[float, float]]:
@@ -32,9 +32,9 @@ def places_by_hand(pose, radius, robot, actions) -> list[tuple[float, float]]:
     return [*(at(pose, *w) for w in wheels), *(at(before, *w) for w in wheels), *(at(pose, *c) for c in chassis)]
 
 
-def test_stencils_are_the_nodes_nearest_to_their_places(setting):
-    robot, actions, grid = setting
-    table, rng = stencil(robot, actions, grid), np.random.default_rng(0)
+def test_stencils_are_the_nodes_nearest_to_their_places(setup):
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
+    table, rng = stencil(setup), np.random.default_rng(0)
     radii, split = np.asarray(actions.radii), table.first_poses
     for arc in rng.choice(len(table.nodes), min(len(table.nodes), 6), replace=False):
         turn, first = divmod(int(arc), len(radii))
@@ -49,9 +49,8 @@ def test_stencils_are_the_nodes_nearest_to_their_places(setting):
                     assert np.abs(off).max() <= 0.5 + 1e-6
 
 
-def test_the_first_places_are_the_nodes_under_the_wheels_in_the_simulator(setting):
-    robot, actions, grid = setting
-    table, simulated = stencil(robot, actions, grid), node_table(robot, actions, grid)
+def test_the_first_places_are_the_nodes_under_the_wheels_in_the_simulator(setup):
+    actions, table, simulated = setup.actions, stencil(setup), setup.node_table()
     turns, radii = actions.turns, len(actions.radii)
     assert table.nodes.shape[1:] == (simulated.layout.poses, STENCIL_NODES) and len(table.nodes) == turns * radii
     own = {tuple(wheels.ravel()) for wheels in table.nodes[..., :4]}
@@ -59,22 +58,23 @@ def test_the_first_places_are_the_nodes_under_the_wheels_in_the_simulator(settin
 
 
 def test_stencils_are_integers_in_the_map_and_read_only():
-    robot, actions, grid = SETTINGS["coarse small map"]
-    nodes = stencil(robot, actions, grid).nodes
-    assert nodes.dtype == np.int32 and nodes.min() >= 0 and nodes.max() < grid.nodes**2
+    setup = SETUPS["coarse small map"]
+    nodes = stencil(setup).nodes
+    assert nodes.dtype == np.int32 and nodes.min() >= 0 and nodes.max() < setup.grid.nodes**2
     with pytest.raises(ValueError, match="read-only"):
         nodes[0] = 0
 
 
 def test_places_off_the_map_are_on_its_edge():
-    robot, actions, grid = SETTINGS["coarse small map"]
-    nodes = nodes_at(np.array([100.0, -100.0, 0.3]), np.array(math.inf), robot, actions, grid)
-    assert set(nodes.tolist()) == {grid.nodes - 1}  # the south-east corner
+    setup = SETUPS["coarse small map"]
+    nodes = nodes_at(np.array([100.0, -100.0, 0.3]), np.array(math.inf), setup)
+    assert set(nodes.tolist()) == {setup.grid.nodes - 1}  # the south-east corner
 
 
 def test_places_under_the_chassis_are_within_it():
-    robot, actions, grid = SETTINGS["fine large map"]
-    nodes = nodes_at(np.zeros(3), np.array(math.inf), robot, actions, grid)[8:].reshape(2, ALONG)
+    setup = SETUPS["fine large map"]
+    robot, grid = setup.robot, setup.grid
+    nodes = nodes_at(np.zeros(3), np.array(math.inf), setup)[8:].reshape(2, ALONG)
     row, col = np.divmod(nodes, grid.nodes)
     assert np.abs((col - grid.cells // 2) * grid.spacing).max() <= robot.chassis_width / 2
     assert np.abs((row - grid.cells // 2) * grid.spacing).max() <= robot.chassis_length / 2
@@ -82,7 +82,6 @@ def test_places_under_the_chassis_are_within_it():
 
 
 def test_what_does_not_fit_together_is_refused():
-    robot, actions, _ = SETTINGS["paper"]
-    small = SETTINGS["coarse small map"].grid
+    setup = replace(SETUPS["paper"], grid=SETUPS["coarse small map"].grid)
     with pytest.raises(InputError, match="leave the 4 m map"):
-        stencil(robot, actions, small)
+        stencil(setup)

@@ -8,7 +8,7 @@ from sklearn.linear_model import LogisticRegression as Oracle
 
 from tests import field_runs
 from tests.commandline import FEW
-from tests.small_training import GRID, HUSKY, PRESET, dataset, estimator, forward, run_of
+from tests.small_training import GRID, HUSKY, PRESET, SETUP, dataset, estimator, forward, run_of
 from travjax.config import InputError, require
 from travjax.data.sampling import balanced_subset
 from travjax.devices import Devices
@@ -19,6 +19,7 @@ from travjax.models.variables import split_model
 from travjax.runs.evaluator import Evaluator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import unpacked
 
 
@@ -78,7 +79,7 @@ def test_a_data_set_without_test_maps_is_refused():
 
 def test_the_paper_stands_beside_its_own_robot_and_actions_on_synthetic_maps_only(evaluator):
     assert evaluator.paper is None
-    papers = replace(run_of(), robot=Robot.load("seekur_jr"), actions=ActionSpace())
+    papers = replace(run_of(), setup=Setup(Robot.load("seekur_jr"), ActionSpace(), GRID))
     assert replace(evaluator, run=papers).paper == PAPER_SYNTHETIC
     assert replace(evaluator, run=papers, dataset=replace(dataset(), config=None)).paper is None
 
@@ -86,7 +87,7 @@ def test_the_paper_stands_beside_its_own_robot_and_actions_on_synthetic_maps_onl
 def test_a_figure_takes_no_longer_than_the_evaluation(evaluator):
     """18 trajectories a map, 3 radii; every third or sixth would leave out arcs."""
     assert [evaluator.every(2, samples) for samples in (100, 36, 35, 18, 9, 8, 1)] == [1, 1, 2, 2, 4, 5, 5]
-    papers = replace(evaluator, run=replace(run_of(), actions=ActionSpace()))
+    papers = replace(evaluator, run=replace(run_of(), setup=replace(SETUP, actions=ActionSpace())))
     assert [papers.every(2, samples) for samples in (400, 3042, 6083, 6084)] == [6, 2, 2, 1]
     some = ActionSpace().split(np.arange(0, 3042, 6))
     assert [len(np.unique(part)) for part in some] == [18, 13, 13]
@@ -111,7 +112,7 @@ def test_a_batch_that_the_devices_cannot_share_is_refused(monkeypatch):
 )
 def test_a_data_set_of_something_else_is_refused(other):
     with pytest.raises(InputError, match=f"^{next(iter(other))} of the data set: ") as raised:
-        Evaluator.from_run(replace(run_of(), **other), dataset(), Devices.all())
+        Evaluator.from_run(replace(run_of(), setup=replace(SETUP, **other)), dataset(), Devices.all())
     assert "\n" not in str(raised.value)
 
 

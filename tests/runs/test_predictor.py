@@ -11,7 +11,7 @@ import pytest
 import travjax
 from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
-from tests.small_training import GRID, HUSKY, copy, dataset, run_of
+from tests.small_training import GRID, HUSKY, SETUP, copy, dataset, run_of
 from tests.small_training import estimator as resnet
 from travjax.config import InputError
 from travjax.data.sampling import every_sample
@@ -28,6 +28,7 @@ from travjax.runs.predictor import DEFAULT, WEIGHTS, Predictor, predict
 from travjax.runs.run import Run, load_estimator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.terrain.styles import STYLES, generate_terrain
 
 pytestmark = pytest.mark.usefixtures("shared_code")
@@ -118,7 +119,7 @@ def test_a_resnet_is_loaded_from_its_run(trained):
 def test_probabilities_and_margins_are_the_network_s(tiny):
     heights = dataset().heights[:6]
     found = tiny.predict(heights)
-    source = MapSource.from_maps(heights, HUSKY, FEW, GRID, RUN.preset.elevation_scale)
+    source = MapSource.from_maps(heights, SETUP, RUN.preset.elevation_scale)
     hazards = np.asarray(map_hazards(*split_model(tiny.network), source, np.arange(6)), np.float64)
     np.testing.assert_allclose(found.probability, 1 / (1 + np.exp(-hazards[..., :3])), atol=1e-6)
     np.testing.assert_allclose(found.margins, hazards[..., 3:] * HUSKY.limits, atol=1e-5)
@@ -269,7 +270,7 @@ def packaged() -> Predictor:
 
 def test_the_packaged_estimator_is_for_the_seekur_jr_and_the_paper_s_actions(packaged):
     run = packaged.run
-    wanted = Run(run.preset, Robot.load("seekur_jr"), ActionSpace(), travjax.Grid())
+    wanted = Run(run.preset, Setup(Robot.load("seekur_jr")))
     assert run == wanted and run.preset.model == "field"
     assert (WEIGHTS / f"{DEFAULT}.safetensors").stat().st_size <= 15e6
     assert (WEIGHTS / f"{DEFAULT}.md").read_text().startswith(f"# {DEFAULT}.safetensors\n")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.commandline import FEW
-from tests.small_training import GRID, HUSKY, PRESET, copy, host, loads, require_equal, run_of, saved_state
+from tests.small_training import GRID, HUSKY, PRESET, SETUP, copy, host, loads, require_equal, run_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
 from travjax.estimators.preset import EvaluationConfig
@@ -38,7 +38,7 @@ def test_a_run_comes_back_as_it_was_saved(tmp_path):
 
 
 def test_the_run_of_the_command_is_the_preset(trained):
-    assert Run.load(trained) == Run(PRESET, HUSKY, FEW, GRID)
+    assert Run.load(trained) == Run(PRESET, SETUP)
 
 
 def test_a_folder_without_a_run_is_named(tmp_path):
@@ -121,8 +121,12 @@ def test_what_does_not_matter_to_a_run_that_has_begun_may_differ():
     [
         (run_of(learning_rate=2e-3), "preset.training.learning_rate", ("0.002", "0.001")),
         (replace(run_of(), preset=replace(PRESET, elevation_scale=2.0)), "preset.elevation_scale", ("2.0", "0.5")),
-        (replace(run_of(), robot=replace(HUSKY, track=0.6)), "robot.track", ("0.6", repr(HUSKY.track))),
-        (replace(run_of(), actions=replace(FEW, turns=3)), "actions.turns", ("3", "2")),
+        (
+            replace(run_of(), setup=replace(SETUP, robot=replace(HUSKY, track=0.6))),
+            "robot.track",
+            ("0.6", repr(HUSKY.track)),
+        ),
+        (replace(run_of(), setup=replace(SETUP, actions=replace(FEW, turns=3))), "actions.turns", ("3", "2")),
     ],
 )
 def test_the_first_setting_that_differs_is_named(other, name, values):

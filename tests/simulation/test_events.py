@@ -23,9 +23,11 @@ from travjax.runs.predictor import Predictor
 from travjax.runs.run_log import read_rows
 from travjax.simulation import events, reference, robot
 from travjax.simulation.events import EVENTS, OPTIONAL, PAPER, Event, Pose, label_bit, label_codes
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import failures, packed, simulate, unpacked
 
 ROLLING = replace(HUSKY, max_roll=math.radians(6))
+SETUP = Setup(ROLLING, FEW, GRID)
 FOUR = (*EVENTS, "roll")
 
 FIELD_TOML = """
@@ -48,7 +50,7 @@ RESNET_TOML = "[trunk]" + TOML.partition("[trunk]")[2].replace("batch_size = 8",
 @functools.cache
 def rolling() -> Dataset:
     """The data set of the small training, for the robot that must not roll."""
-    return generate(PRESET.dataset, ROLLING, FEW, GRID)
+    return generate(PRESET.dataset, SETUP)
 
 
 @functools.cache
@@ -194,7 +196,7 @@ def test_a_data_set_comes_back_with_its_events(tmp_path):
 
 def test_labels_of_more_events_than_the_robot_has_are_refused():
     with pytest.raises(InputError, match="^labels = [0-9]+: must be from 0 to 15$"):
-        replace(rolling(), robot=HUSKY)
+        replace(rolling(), setup=replace(SETUP, robot=HUSKY))
 
 
 def test_a_balanced_subset_takes_trajectories_that_only_roll():
@@ -204,7 +206,7 @@ def test_a_balanced_subset_takes_trajectories_that_only_roll():
 
 
 def test_a_labelled_batch_has_the_margin_by_name():
-    batch = labelled({"heights": holes()}, ROLLING, FEW, GRID)
+    batch = labelled({"heights": holes()}, SETUP)
     assert list(batch) == ["heights", *FOUR, "known", "failed"] and batch["failed"].shape[-1] == 4
 
 
@@ -236,7 +238,7 @@ def test_scores_go_by_the_four_events():
 
 def test_figures_have_a_column_of_roll(tmp_path):
     failed, known = map(np.asarray, unpacked(rolling().labels[:2], ROLLING))
-    drawn = map_figures.labelled_maps(rolling().heights[:2], failed, known, ["a", "b"], ROLLING, FEW, GRID)
+    drawn = map_figures.labelled_maps(rolling().heights[:2], failed, known, ["a", "b"], SETUP)
     titles = [ax.get_title() for ax in drawn.axes]
     share = failed[0, :, 3][known[0]].mean()
     assert f"roll: {share:.1%} of known fail" in titles

@@ -109,9 +109,9 @@ def assert_same_pose(pose, expected):
 # Nodes
 
 
-def test_wheels_stand_on_their_nearest_nodes(setting):
-    robot, actions, grid = setting
-    table = node_table(*setting)
+def test_wheels_stand_on_their_nearest_nodes(setup):
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
+    table = setup.node_table()
     for trajectory in some_trajectories(table):
         arc, positions, view = place_of(table, trajectory)
         order = [1, 0, 3, 2] if table.layout.views[view].mirrored else [0, 1, 2, 3]
@@ -120,9 +120,9 @@ def test_wheels_stand_on_their_nearest_nodes(setting):
         np.testing.assert_array_equal(np.stack(np.divmod(wheels, grid.nodes), axis=-1), expected)
 
 
-def test_the_chassis_covers_the_nodes_under_it(setting):
-    robot, actions, grid = setting
-    table = node_table(*setting)
+def test_the_chassis_covers_the_nodes_under_it(setup):
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
+    table = setup.node_table()
     for trajectory in some_trajectories(table):
         arc, positions, view = place_of(table, trajectory)
         for position, pose in zip(positions, reference.poses(actions, trajectory), strict=True):
@@ -131,8 +131,8 @@ def test_the_chassis_covers_the_nodes_under_it(setting):
 
 
 @pytest.mark.parametrize("run", [1, 2, RUN, 7])
-def test_runs_and_singles_cover_the_nodes_of_the_chassis(setting, run):
-    table = node_table(*setting)
+def test_runs_and_singles_cover_the_nodes_of_the_chassis(setup, run):
+    table = setup.node_table()
     none, every = chassis_places(table.chassis, 1)
     runs, singles = chassis_places(table.chassis, run)
     assert none.size == 0
@@ -177,9 +177,9 @@ def test_all_nodes_are_single_where_a_pose_has_no_row_as_long_as_a_run():
     assert covered_by(singles[1, 0]) == {(0, 0), (0, 1), (0, 2)}
 
 
-def test_centre_offset_and_axes_are_those_of_the_poses_in_the_view(setting):
-    _, actions, grid = setting
-    table = node_table(*setting)
+def test_centre_offset_and_axes_are_those_of_the_poses_in_the_view(setup):
+    actions, grid = setup.actions, setup.grid
+    table = setup.node_table()
     for trajectory in some_trajectories(table):
         arc, positions, view = place_of(table, trajectory)
         row, col = np.divmod(table.centre[arc, positions], grid.nodes)
@@ -191,17 +191,17 @@ def test_centre_offset_and_axes_are_those_of_the_poses_in_the_view(setting):
         assert np.abs(table.offset).max() <= 0.5 + 1e-6
 
 
-def test_every_trajectory_has_its_own_place(setting):
-    table = node_table(*setting)
+def test_every_trajectory_has_its_own_place(setup):
+    table = setup.node_table()
     places = len(table.centre) * table.layout.second_arcs * len(table.layout.views)
-    assert table.source.shape == (len(setting.actions),)
+    assert table.source.shape == (len(setup.actions),)
     assert len(np.unique(table.source)) == len(table.source)
     assert 0 <= table.source.min() and table.source.max() < places
 
 
-def test_shapes_are_those_of_the_layout(setting):
-    _, actions, grid = setting
-    table = node_table(*setting)
+def test_shapes_are_those_of_the_layout(setup):
+    actions, grid = setup.actions, setup.grid
+    table = setup.node_table()
     layout, arcs = table.layout, len(table.centre)
     assert layout.grid == grid
     assert layout.second_arcs == len(actions.radii)

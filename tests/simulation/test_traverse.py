@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.conftest import SETTINGS
+from tests.conftest import SETUPS
 from travjax.config import InputError
 from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
@@ -109,8 +109,8 @@ def test_the_maps_show_all_outcomes(maps, oracle):
     assert 0.1 < oracle["holes"][1].known.mean() < 0.9
 
 
-def assert_setting_agrees(setting, count):
-    robot, actions, grid = setting
+def assert_setup_agrees(setup, count):
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     heights = np.stack([rough_ground(grid, seed) for seed in range(count)])
     margins = simulate(heights, robot, actions, grid=grid)
     assert margins.step.shape == (count, len(actions))
@@ -119,15 +119,15 @@ def assert_setting_agrees(setting, count):
     assert_agrees(of_map(margins, -1), expected, sample, robot)
 
 
-def test_other_settings_agree_with_the_sequential_simulator(setting):
-    assert_setting_agrees(setting, 1)
+def test_other_setups_agree_with_the_sequential_simulator(setup):
+    assert_setup_agrees(setup, 1)
 
 
 @pytest.mark.parametrize(
-    "setting", ["odd number of turns", "ties and quarter circles", "chassis longer than 127 nodes"], indirect=True
+    "setup", ["odd number of turns", "ties and quarter circles", "chassis longer than 127 nodes"], indirect=True
 )
-def test_batches_of_other_settings_agree_with_the_sequential_simulator(setting):
-    assert_setting_agrees(setting, 3)
+def test_batches_of_other_setups_agree_with_the_sequential_simulator(setup):
+    assert_setup_agrees(setup, 3)
 
 
 @pytest.mark.gpu
@@ -350,7 +350,8 @@ def test_margins_do_not_depend_on_the_position_in_the_batch(pool, chosen):
 )
 def test_a_map_has_the_same_bits_in_any_batch(name):
     """Loops over few maps and views are compiled in other ways than those over many: these differed in 1e-8 m."""
-    robot, actions, grid = SETTINGS[name]
+    setup = SETUPS[name]
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     heights = generate_terrain([*STYLES, *STYLES, "rough", "smooth"], range(12), grid=grid)
     wanted = simulate(heights, robot, actions, grid=grid)
     for count in (1, 2, 4, 7):

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from tests.commandline import FEW, files
-from tests.small_training import GRID, HUSKY, PRESET, TOML, copy, rows_of
+from tests.commandline import files
+from tests.small_training import PRESET, SETUP, TOML, copy, rows_of
 from travjax.config import InputError
 from travjax.runs.run import Run
 from travjax.simulation.actions import ActionSpace
@@ -23,9 +23,7 @@ def test_the_run_of_a_preset_is_for_its_robot_and_the_paper_s_actions():
 
 def test_what_differs_from_the_preset_is_taken(tmp_path, few):
     (tmp_path / "tiny.toml").write_text(TOML)
-    assert run_from_preset(tmp_path / "tiny.toml", actions=few, size=4.0, spacing=0.125) == Run(
-        PRESET, HUSKY, FEW, GRID
-    )
+    assert run_from_preset(tmp_path / "tiny.toml", actions=few, size=4.0, spacing=0.125) == Run(PRESET, SETUP)
     run = run_from_preset(PRESET, robot="leo_rover", actions=few, weights="w.npz", seed=7)
     assert (run.robot.name, run.preset.robot, run.preset.weights) == ("Leo Rover", "leo_rover", "w.npz")
     assert run.preset.dataset.seed == run.preset.training.seed == 7

@@ -11,13 +11,14 @@ from travjax.evaluation import simulator_benchmark
 from travjax.models.trajectory_resnet import create
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.grid import Grid
+from travjax.simulation.setup import Setup
 from travjax.training.network_benchmark import COLUMNS, FLAX, TORCH, Bench, torch_estimator, with_ratio
 
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict]:
     """Of a small network, without PyTorch."""
-    small = Bench(HUSKY, FEW, Grid(4, 0.125), repeats=2, trunk=ResNetConfig((1,), 4))
+    small = Bench(Setup(HUSKY, FEW, Grid(4, 0.125)), repeats=2, trunk=ResNetConfig((1,), 4))
     return [small.inputs(), small.training_step(), small.all_trajectories()]
 
 

@@ -11,7 +11,7 @@ import pytest
 from flax import nnx
 
 from tests.commandline import FEW
-from tests.small_training import GRID, HUSKY, PRESET, dataset, require_equal, rows_of, saved_state
+from tests.small_training import PRESET, SETUP, dataset, require_equal, rows_of, saved_state
 from travjax.config import InputError
 from travjax.devices import Devices
 from travjax.estimators.inference import over_samples
@@ -57,7 +57,7 @@ class PooledEstimator(EstimatorKind):
     def create(self, preset, robot, seed=0, weights=None):
         return Pooled(len(FEW), nnx.Rngs(key_of(seed)))
 
-    def source(self, preset, heights, robot, actions, grid, on_progress=lambda count: None):
+    def source(self, preset, heights, setup, on_progress=lambda count: None):
         return elevation_channel(heights, preset.elevation_scale)
 
     def data(self, preset, dataset):
@@ -81,7 +81,7 @@ def entry():
 @pytest.fixture(scope="module")
 def run(entry) -> Run:
     training = replace(PRESET.training, head_epochs=0, epochs=6, learning_rate=0.05, resample_each_epoch=False)
-    return Run(replace(PRESET, model="pooled", training=training), HUSKY, FEW, GRID)
+    return Run(replace(PRESET, model="pooled", training=training), SETUP)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from tests.small_training import (
     GRID,
     HUSKY,
     PRESET,
+    SETUP,
     begun,
     copy,
     dataset,
@@ -44,7 +45,6 @@ from travjax.models.variables import merge_model, split_model
 from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import EVENTS
 from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
@@ -163,7 +163,7 @@ def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
 
 
 def source() -> ImageSource:
-    return ImageSource(dataset().heights, trajectory_bank(HUSKY, FEW, GRID), np.float32(0.5))
+    return ImageSource(dataset().heights, trajectory_bank(SETUP), np.float32(0.5))
 
 
 def trainer_samples(count: int = 32):
@@ -560,10 +560,10 @@ def test_a_full_disk_stops_training_and_keeps_the_earlier_checkpoints(tmp_path, 
 
 
 def test_a_data_set_of_another_robot_or_action_space_is_refused(tmp_path):
-    other = replace(run_of(), actions=ActionSpace(turns=2, arc_lengths=(0.5, 0.7), radii=FEW.radii, interval=0.1))
+    other = replace(run_of(), setup=replace(SETUP, actions=replace(FEW, arc_lengths=(0.5, 0.7))))
     message = refusal(Trainer, other, dataset(), tmp_path, None)
     assert message == ("actions of the data set: arc_lengths = (0.5, 0.6); must be as here: arc_lengths = (0.5, 0.7)")
-    other = replace(run_of(), robot=replace(HUSKY, track=0.6))
+    other = replace(run_of(), setup=replace(SETUP, robot=replace(HUSKY, track=0.6)))
     assert refusal(Trainer, other, dataset(), tmp_path, None).startswith("robot of the data set: track = ")
 
 

@@ -28,14 +28,14 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures terrain and labelling, or the network."""
-    grid, robot, actions = options.setup(arguments)
+    setup = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     if arguments.network:
         from travjax.training import network_benchmark
 
-        network_benchmark.measure(robot, actions, grid, arguments.out, arguments.repeats)
+        network_benchmark.measure(setup, arguments.out, arguments.repeats)
     else:
         from travjax.evaluation import simulator_benchmark
 
         require(arguments.stream >= 0, "--stream", arguments.stream, "at least 0")
-        simulator_benchmark.measure(robot, actions, grid, arguments.out, arguments.repeats, arguments.stream)
+        simulator_benchmark.measure(setup, arguments.out, arguments.repeats, arguments.stream)

@@ -126,11 +126,11 @@ def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
     named = SitesConfig.load(find_preset(arguments.sites, "sites")) if arguments.sites else None
     real = _sites(arguments) if files else named
     synthetic = None if real else DatasetConfig(*(getattr(arguments, name) for name in SYNTHETIC))
-    grid, robot, actions = options.setup(arguments)
+    setup = options.setup(arguments)
     if real:
-        return build_from_sites(real, robot, actions, grid, folder)
+        return build_from_sites(real, setup, folder)
     assert synthetic
-    return build_synthetic(synthetic, robot, actions, grid, folder)
+    return build_synthetic(synthetic, setup, folder)
 
 
 def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where: str) -> None:

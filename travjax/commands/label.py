@@ -30,6 +30,6 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Labels every trajectory of the maps and writes the results."""
-    grid, robot, actions = options.setup(arguments)
-    maps = options.maps(arguments, grid)
-    label_maps(maps, robot, actions, grid, arguments.out, figures=not arguments.no_figures)
+    setup = options.setup(arguments)
+    maps = options.maps(arguments, setup.grid)
+    label_maps(maps, setup, arguments.out, figures=not arguments.no_figures)

@@ -9,34 +9,28 @@ from travjax.data import sites
 from travjax.data.dataset import Dataset, DatasetConfig, Progress, generate, is_dataset, save
 from travjax.data.provenance import SitesConfig
 from travjax.files import output_folder, put_back, resolved, user_path
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.terrain.styles import world_note
 
 
-def build_synthetic(
-    config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: str | Path
-) -> Dataset:
+def build_synthetic(config: DatasetConfig, setup: Setup, folder: str | Path) -> Dataset:
     """Makes and labels synthetic maps, and saves the data set in a folder, with progress bars.
 
     An existing data set is replaced. Raises InputError when robot, actions and grid do not fit together, when the maps
     do not fit in memory, and when the folder holds something else or the data set cannot be written.
     """
-    if note := world_note(config.world, grid):
+    if note := world_note(config.world, setup.grid):
         progress.say(note)
-    make = lambda on_progress: generate(config, robot, actions, grid, on_progress)
+    make = lambda on_progress: generate(config, setup, on_progress)
     return _saved(make, config.maps, user_path(folder), f"--maps = {config.maps}")
 
 
-def build_from_sites(
-    config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, folder: str | Path
-) -> Dataset:
+def build_from_sites(config: SitesConfig, setup: Setup, folder: str | Path) -> Dataset:
     """Cuts the windows of real sites, labels them, and saves the data set in a folder, with progress bars.
 
     Raises InputError as `build_synthetic` does, and when a file is missing, cannot be read or leaves no window.
     """
-    make = lambda on_progress: sites.read(config, robot, actions, grid, on_progress)
+    make = lambda on_progress: sites.read(config, setup, on_progress)
     return _saved(make, None, user_path(folder), "the sites' windows")
 
 

@@ -4,7 +4,6 @@
 folder of .npy files with a `dataset.json` that holds the configurations and each file's size and SHA-256.
 """
 
-import dataclasses
 import hashlib
 import json
 import math
@@ -22,7 +21,6 @@ import numpy as np
 from travjax.config import (
     InputError,
     naming,
-    one_line,
     parts_from_json,
     read_json,
     require,
@@ -35,10 +33,10 @@ from travjax.data.sampling import Samples, random_keys
 from travjax.files import atomic_write_folder, put_back, sha256, user_path
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import label_codes
-from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, packed, simulate, unpacked
+from travjax.simulation.setup import PARTS, Setup
+from travjax.simulation.traverse import failures, margins_of, packed, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain, require_world
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
@@ -129,7 +127,7 @@ class Dataset:
     group:   [n] name of the style (if there is a `config`) or of the site
     seed:    [n] uint32 terrain seed; 0 for real maps
     split:   [n] uint8 index into SPLITS
-    robot, actions, grid: the setup that the labels are valid for
+    setup:   robot, action space and grid that the labels are valid for
     config:  configuration of synthetic maps; None for real maps
     provenance: where real maps come from; None if unknown
 
@@ -141,9 +139,7 @@ class Dataset:
     group: np.ndarray
     seed: np.ndarray
     split: np.ndarray
-    robot: Robot
-    actions: ActionSpace
-    grid: Grid
+    setup: Setup
     config: DatasetConfig | None
     provenance: Provenance | None = None
 
@@ -175,6 +171,21 @@ class Dataset:
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
 
     @property
+    def robot(self) -> Robot:
+        """The robot of the setup."""
+        return self.setup.robot
+
+    @property
+    def actions(self) -> ActionSpace:
+        """The action space of the setup."""
+        return self.setup.actions
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the setup."""
+        return self.setup.grid
+
+    @property
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays by name; those of the provenance come last."""
         return {name: getattr(self, name) for name in ARRAYS} | (self.provenance.arrays if self.provenance else {})
@@ -198,57 +209,43 @@ class Dataset:
         return np.asarray(unpacked(self.labels[samples], self.robot)[0])
 
 
-def generate(
-    config: DatasetConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
-) -> Dataset:
+def generate(config: DatasetConfig, setup: Setup, on_progress: Progress | None = None) -> Dataset:
     """Makes and labels the maps; the same arguments give the same data set.
 
     on_progress is called with the number of maps that were added. Needs memory for the arrays, 4.0 GB for the paper's
     56,840 maps, and a few hundred MB more. Raises InputError when robot, actions and grid do not fit together.
     """
-    node_table(robot, actions, grid)
+    setup.node_table()
     styles, seeds = config.styles(), config.seeds()
-    heights = np.empty((config.maps, *grid.shape), np.float32)
-    labels = np.empty((config.maps, len(actions)), np.uint8)
+    heights = np.empty((config.maps, *setup.grid.shape), np.float32)
+    labels = np.empty((config.maps, len(setup.actions)), np.uint8)
     for start in range(0, config.maps, MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, config.maps))
-        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=grid, world=config.world)
-        margins = simulate(made, robot, actions, grid=grid)
-        labels[chunk] = packed(failures(margins, robot), margins.known)
+        made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=setup.grid, world=config.world)
+        margins = margins_of(made, setup)
+        labels[chunk] = packed(failures(margins, setup.robot), margins.known)
         heights[chunk] = made
         if on_progress:
             on_progress(chunk.stop - start)
-    return Dataset(heights, labels, styles, seeds, config.splits(), robot, actions, grid, config)
-
-
-def require_matching(dataset: Dataset, robot: Robot, actions: ActionSpace, grid: Grid) -> None:
-    """Raises InputError, with both values, unless the data set is labelled for this robot, action space and grid."""
-    for name, given in (("robot", robot), ("actions", actions), ("grid", grid)):
-        ours = getattr(dataset, name)
-        if ours != given:
-            fields = [field.name for field in dataclasses.fields(ours)]
-            differing = [field for field in fields if getattr(ours, field) != getattr(given, field)]
-            both = [", ".join(f"{field} = {getattr(one, field)!r}" for field in differing) for one in (ours, given)]
-            theirs, wanted = (one_line(one, 160) for one in both)
-            raise InputError(f"{name} of the data set: {theirs}; must be as here: {wanted}")
+    return Dataset(heights, labels, styles, seeds, config.splits(), setup, config)
 
 
 def configs_to_json(dataset: Dataset) -> dict[str, Any]:
     """Converts all of a data set except its arrays to what JSON can hold, with the version of travjax."""
-    parts = {name: getattr(dataset, name) for name in ("robot", "actions", "grid", "config")}
-    table = {name: part and to_json(part) for name, part in parts.items()} | {"travjax": version("travjax")}
+    config = dataset.config and to_json(dataset.config)
+    table = dataset.setup.to_json() | {"config": config, "travjax": version("travjax")}
     return table | ({"provenance": dataset.provenance.to_json()} if dataset.provenance else {})
 
 
 def dataset_from_arrays(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
     """Restores a data set from its arrays and the output of `configs_to_json`; raises InputError for anything else."""
     synthetic = table.get("config") is not None
-    kinds = {"robot": Robot, "actions": ActionSpace, "grid": Grid} | ({"config": DatasetConfig} if synthetic else {})
-    configs = {"config": None} | parts_from_json(table, kinds)
+    parts = parts_from_json(table, PARTS | ({"config": DatasetConfig} if synthetic else {}))
+    config = parts.pop("config", None)
     places = {name: array for name, array in arrays.items() if name in PROVENANCE_ARRAYS}
     provenance = Provenance.from_json(table["provenance"], **places) if "provenance" in table else None
-    parts: dict[str, Any] = configs | {name: arrays[name] for name in ARRAYS}
-    return Dataset(**parts, provenance=provenance)
+    own = {name: arrays[name] for name in ARRAYS}
+    return Dataset(**own, setup=Setup(**parts), config=config, provenance=provenance)
 
 
 def save(dataset: Dataset, folder: str | Path, on_progress: Progress | None = None) -> None:

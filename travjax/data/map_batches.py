@@ -18,10 +18,9 @@ from travjax.batching import BATCH
 from travjax.config import one_line, require, to_json
 from travjax.data.dem import Windows, load_dem
 from travjax.rasters.reading_options import DemOptions
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, simulate
+from travjax.simulation.setup import Setup
+from travjax.simulation.traverse import failures, margins_of
 from travjax.terrain.rock_field import rock_fields, sample_rock_field
 from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params, world_note
 
@@ -170,23 +169,25 @@ def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
             }
 
 
-def labelled(batch: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> Batch:
+def labelled(batch: Batch, setup: Setup) -> Batch:
     """Adds to a batch `known` and the margin of each of the robot's k events by name, [n, t], and `failed` [n, t, k].
 
     Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
     """
-    margins = simulate(batch["heights"], robot, actions, grid=grid)
+    margins = margins_of(batch["heights"], setup)
     numbers = np.isfinite(np.asarray(margins.events())).all(axis=-1)
     allowed = "finite where the ground is known"
-    require(bool((numbers | ~np.asarray(margins.known)).all()), f"margins of {robot.name}", "NaN or infinity", allowed)
+    require(
+        bool((numbers | ~np.asarray(margins.known)).all()), f"margins of {setup.robot.name}", "NaN or infinity", allowed
+    )
     arrays = {name: margins[name] for name in margins.names}
-    arrays |= {"known": margins.known, "failed": failures(margins, robot)}
+    arrays |= {"known": margins.known, "failed": failures(margins, setup.robot)}
     return batch | {name: np.asarray(array) for name, array in arrays.items()}
 
 
-def bytes_each(robot: Robot, actions: ActionSpace, grid: Grid) -> int:
+def bytes_each(setup: Setup) -> int:
     """Returns the bytes of a labelled map: heights, and per trajectory `known` and each event's margin and flag."""
-    return 4 * grid.nodes**2 + len(actions) * (5 * len(robot.events) + 1)
+    return 4 * setup.grid.nodes**2 + len(setup.actions) * (5 * len(setup.robot.events) + 1)
 
 
 def joined(batches: list[Batch]) -> Batch:

@@ -28,12 +28,10 @@ from travjax.data.provenance import SPLITS, Provenance, Site, SiteRecord, SitesC
 from travjax.data.sampling import are_known
 from travjax.files import find_data
 from travjax.rasters.coordinates import is_local, places
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import UNKNOWN_LABEL
-from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, packed, simulate
+from travjax.simulation.setup import Setup
+from travjax.simulation.traverse import failures, margins_of, packed
 
 
 class Assignment(IntEnum):
@@ -54,21 +52,20 @@ DOUBT = 10.0
 """Metres by which positions in two coordinate systems may disagree: other frame realisations, missing grids."""
 
 
-def read(
-    config: SitesConfig, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None = None
-) -> Dataset:
+def read(config: SitesConfig, setup: Setup, on_progress: Progress | None = None) -> Dataset:
     """Cuts, labels and splits the windows of the sites, site by site; rotated copies come last.
 
     on_progress is called with the number of maps that were labelled. Raises InputError when robot, actions and grid do
     not fit together, when a file is missing, cannot be read or is given twice, and when a site has no window left for a
     split that was asked for.
     """
-    node_table(robot, actions, grid)
+    setup.node_table()
+    grid = setup.grid
     found = [_windows(site, config, grid) for site in config.site]
     _require_different(found)
-    label = lambda heights: _labels(heights, robot, actions, grid, on_progress)
+    label = lambda heights: _labels(heights, setup, on_progress)
     windows = _Candidates(found)
-    labels = np.full((len(windows.site), len(actions)), UNKNOWN_LABEL, np.uint8)
+    labels = np.full((len(windows.site), len(setup.actions)), UNKNOWN_LABEL, np.uint8)
     for some, heights in windows.batches():
         enough = np.isnan(heights).mean(axis=(1, 2)) <= config.max_unknown
         labels[some[enough]] = label(heights[enough])
@@ -91,9 +88,7 @@ def read(
         group=np.array([site.group for site in config.site])[windows.site[source]],
         seed=np.zeros(len(source), np.uint32),
         split=assignment[source],
-        robot=robot,
-        actions=actions,
-        grid=grid,
+        setup=setup,
         config=None,
         provenance=Provenance(windows.origin[source], turns, config, records),
     )
@@ -185,15 +180,13 @@ def _require_different(found: list[Windows]) -> None:
         first[windows.sha256] = windows.path
 
 
-def _labels(
-    heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Progress | None
-) -> np.ndarray:
+def _labels(heights: np.ndarray, setup: Setup, on_progress: Progress | None) -> np.ndarray:
     """Simulates all trajectories of maps and returns their labels: [n, t] uint8."""
-    labels = np.empty((len(heights), len(actions)), np.uint8)
+    labels = np.empty((len(heights), len(setup.actions)), np.uint8)
     for start in range(0, len(heights), MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, len(heights)))
-        margins = simulate(heights[chunk], robot, actions, grid=grid)
-        labels[chunk] = packed(failures(margins, robot), margins.known)
+        margins = margins_of(heights[chunk], setup)
+        labels[chunk] = packed(failures(margins, setup.robot), margins.known)
         if on_progress:
             on_progress(chunk.stop - start)
     return labels

@@ -19,9 +19,8 @@ from travjax.estimators.inference import Placed, Progress
 from travjax.estimators.preset import Preset
 from travjax.models.variables import Network, Variables
 from travjax.resnet.imagenet_weights import Weights
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 AT_ONCE = 64
 """Samples in a batch on each device when all trajectories of maps are asked for."""
@@ -128,9 +127,7 @@ class EstimatorKind(Protocol):
         self,
         preset: Preset,
         heights: Float[np.ndarray, "n rows cols"],
-        robot: Robot,
-        actions: ActionSpace,
-        grid: Grid,
+        setup: Setup,
         on_progress: Progress = lambda count: None,
     ) -> PyTree:
         """Returns the arrays to put on the devices for maps, NaN unknown; on_progress: is told of trajectories."""

@@ -23,9 +23,8 @@ from travjax.estimators.preset import Preset
 from travjax.models.hazard_field import LARGE_MARGIN, HazardField, create
 from travjax.models.variables import Variables, merge_model
 from travjax.resnet.imagenet_weights import Weights
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 SMALL_ERROR = 0.3
 """Error of a margin, in limits, up to which it counts by its square."""
@@ -86,13 +85,11 @@ class MapEstimator(EstimatorKind):
         self,
         preset: Preset,
         heights: Float[np.ndarray, "n rows cols"],
-        robot: Robot,
-        actions: ActionSpace,
-        grid: Grid,
+        setup: Setup,
         on_progress: Progress = lambda count: None,
     ) -> MapSource:
         """Returns the maps and the stencil of all trajectories."""
-        return MapSource.from_maps(heights, robot, actions, grid, preset.elevation_scale)
+        return MapSource.from_maps(heights, setup, preset.elevation_scale)
 
     def data(self, preset: Preset, dataset: Dataset) -> MapSamples:
         """Returns the samples of whole maps."""

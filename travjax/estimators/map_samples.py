@@ -25,11 +25,9 @@ from travjax.estimators.kind import Batch
 from travjax.estimators.preset import Preset
 from travjax.jax_flags import usual_flags
 from travjax.models.pose_stencil import Stencil, stencil
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import views_of
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import simulate
+from travjax.simulation.setup import Setup
+from travjax.simulation.traverse import margins_of
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["heights", "stencil", "elevation_scale"], meta_fields=[])
@@ -45,11 +43,9 @@ class MapSource:
     elevation_scale: float | np.float32
 
     @staticmethod
-    def from_maps(
-        heights: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid, elevation_scale: float
-    ) -> "MapSource":
+    def from_maps(heights: np.ndarray, setup: Setup, elevation_scale: float) -> "MapSource":
         """Takes heights [n, rows, cols] in metres; an unknown node gets the height of the nearest known one."""
-        return MapSource(filled(heights), stencil(robot, actions, grid), np.float32(elevation_scale))
+        return MapSource(filled(heights), stencil(setup), np.float32(elevation_scale))
 
     def elevation(self, map_index: Int[Array, " b"]) -> Float[Array, "b rows cols"]:
         """Returns the network's input for maps."""
@@ -121,8 +117,8 @@ class MapSamples:
         views = views_of(data.actions)
         view = views[rng.integers(len(views))]
         heights = np.ascontiguousarray(np.rot90(data.heights[maps], int(rng.integers(4)), axes=(1, 2)))
-        margins = simulate(heights, data.robot, data.actions, grid=data.grid)
-        table = stencil(data.robot, data.actions, data.grid)
+        margins = margins_of(heights, data.setup)
+        table = stencil(data.setup)
         arcs = self._arcs(table, rng)
         trajectories = (arcs[:, None] * table.second_arcs + np.arange(table.second_arcs)).ravel()
         targets = _targets(margins.events(), view.trajectories(data.actions)[trajectories], data.robot.limits)

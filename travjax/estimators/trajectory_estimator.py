@@ -21,9 +21,8 @@ from travjax.models.input_images import ImageSource
 from travjax.models.trajectory_resnet import Estimator, create
 from travjax.models.variables import Variables, merge_model
 from travjax.resnet.imagenet_weights import Weights
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 
 def _loss(network: Estimator, inputs, failed: Float[Array, "b e"], key: Key[Array, ""]) -> Float[Array, " b"]:
@@ -97,13 +96,11 @@ class TrajectoryEstimator(EstimatorKind):
         self,
         preset: Preset,
         heights: Float[np.ndarray, "n rows cols"],
-        robot: Robot,
-        actions: ActionSpace,
-        grid: Grid,
+        setup: Setup,
         on_progress: Progress = lambda count: None,
     ) -> ImageSource:
         """Returns the maps and the drawn channels of all trajectories."""
-        return ImageSource.from_maps(heights, robot, actions, grid, preset.elevation_scale, on_progress)
+        return ImageSource.from_maps(heights, setup, preset.elevation_scale, on_progress)
 
     def data(self, preset: Preset, dataset: Dataset) -> TrajectorySamples:
         """Returns balanced subsets of trajectories."""

@@ -16,7 +16,6 @@ from travjax.evaluation.tables import ANY, PAPER_SHARES, rows_table
 from travjax.files import first_lines
 from travjax.simulation.events import EVENTS, FAILED, label_bit, label_codes
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import as_in_paper
 
 WINDOW_COLUMNS = {
     "name": "site",
@@ -46,7 +45,7 @@ def are_headings(line: str) -> bool:
 
 def dataset_tables(dataset: Dataset) -> dict[str, str]:
     """Returns tables by headline: the failure shares and, for real maps, how the windows were used."""
-    in_paper = dataset.config is not None and as_in_paper(dataset.robot, dataset.actions)
+    in_paper = dataset.config is not None and dataset.setup.as_in_paper
     sizes = ", ".join(f"{len(dataset.maps_of(split))} {split}" for split in SPLITS)
     trajectories = f"{dataset.robot.name}, {len(dataset.actions)} trajectories a map"
     headline = f"{len(dataset.split)} maps ({sizes}), {trajectories}; shares that fail:"

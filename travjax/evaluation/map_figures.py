@@ -18,9 +18,9 @@ from matplotlib.text import Text
 
 from travjax.config import one_line
 from travjax.files import atomic_write
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR = "#9fd8fb", "#e08a00", "#7a1200", "#8a8a8a"
 DOUBT, FAILURE = 0.25, 0.5
@@ -71,15 +71,14 @@ def labelled_maps(
     failed: np.ndarray,
     known: np.ndarray,
     titles: Sequence[str],
-    robot: Robot,
-    actions: ActionSpace,
-    grid: Grid,
+    setup: Setup,
 ) -> Figure:
     """Draws each map's elevation and, for each event, the action space coloured as safe, failed or unknown.
 
     heights: [n, rows, cols]; failed: [n, t, k] for the robot's k events; known: [n, t]
     Source: the paper's qualitative figure.
     """
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     paths = actions.poses(np.arange(len(actions)))[..., :2]
     columns = 1 + len(robot.events)
     figure = Figure(figsize=(3.25 * columns, 3.2 * len(heights) + 0.7), layout="constrained")
@@ -110,9 +109,7 @@ def predicted_maps(
     failed: np.ndarray | None,
     known: np.ndarray,
     titles: Sequence[str],
-    robot: Robot,
-    actions: ActionSpace,
-    grid: Grid,
+    setup: Setup,
     labelled: str = "true",
     every: int = 1,
 ) -> Figure:
@@ -122,6 +119,7 @@ def predicted_maps(
     [n, t, k], or None to leave out the last row; known: [n, t]; labelled: name of the last row; every: step
     of the trajectories in the action space that predictions are for. Source: the paper's qualitative figure.
     """
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     paths = actions.poses(np.arange(0, len(actions), every))[..., :2]
     rows, columns = len(predictions) + (failed is not None), 1 + len(robot.events)
     figure = Figure(figsize=(3.25 * columns, 3.15 * rows * len(heights) + 0.5), layout="constrained")
@@ -273,8 +271,9 @@ def _dimension(ax, start: tuple[float, float], end: tuple[float, float], name: s
     ax.annotate(text, middle, offset, **place)
 
 
-def action_figure(actions: ActionSpace, robot: Robot, grid: Grid) -> Figure:
+def action_figure(setup: Setup) -> Figure:
     """Draws the action space: the point turns, and all pairs of arcs after one of them (the paper's Fig. 3)."""
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     whole, fan = figure.subplots(1, 2)
     paths = actions.poses(np.arange(len(actions)))[..., :2]

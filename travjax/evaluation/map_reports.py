@@ -10,11 +10,8 @@ from travjax.data.map_batches import Batch, MapStream, bytes_each, joined, label
 from travjax.evaluation import tables
 from travjax.files import output_folder, save_npz, save_text
 from travjax.npz_stream import NpzStream
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.setup import setup_json
-from travjax.simulation.traverse import as_in_paper
+from travjax.simulation.setup import Setup
 
 ON_SHEET = 24
 """The largest number of maps on a contact sheet."""
@@ -47,30 +44,30 @@ def write_terrain(
     return saved
 
 
-def label_maps(
-    maps: MapStream, robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, figures: bool = True
-) -> Path:
+def label_maps(maps: MapStream, setup: Setup, out: str | Path, figures: bool = True) -> Path:
     """Simulates every trajectory of maps, prints the shares that fail, and writes labels, shares and figures.
 
     Returns the path of the .npz of the labels. Raises InputError when they do not fit on the disk or cannot be written.
     """
-    folder = output_folder(out)
-    config = setup_json(robot, actions, grid, files=maps.files, world=maps.world)
-    with NpzStream(folder / "labels.npz", maps.total, bytes_each(robot, actions, grid), "labelled maps") as labels:
-        for batch in _counted((labelled(one, robot, actions, grid) for one in maps.batches), maps.total, "labelling"):
+    folder, robot = output_folder(out), setup.robot
+    config = setup.to_json_text(files=maps.files, world=maps.world)
+    with NpzStream(folder / "labels.npz", maps.total, bytes_each(setup), "labelled maps") as labels:
+        for batch in _counted((labelled(one, setup) for one in maps.batches), maps.total, "labelling"):
             labels.append(batch)
         arrays = labels.arrays
-        in_paper = maps.paper and as_in_paper(robot, actions)
+        in_paper = maps.paper and setup.as_in_paper
         table = tables.shares_table(arrays["group"], arrays["failed"], arrays["known"], in_paper, robot.event_names)
-        labels.save(config=config, cell_size=grid.spacing)
+        labels.save(config=config, cell_size=setup.grid.spacing)
         shares = save_text(folder / "shares.txt", table + "\n")
-        progress.say(f"\nShare of trajectories that fail, {robot.name}, {len(actions)} trajectories a map:\n{table}\n")
+        progress.say(
+            f"\nShare of trajectories that fail, {robot.name}, {len(setup.actions)} trajectories a map:\n{table}\n"
+        )
         unknown = int((~arrays["known"].any(axis=-1)).sum())
         if unknown:
             progress.say(f"{unknown} of {maps.total} maps have no known trajectory; they count in no share.\n")
         progress.wrote(labels.path, shares)
         if figures:
-            _write_figures(arrays, robot, actions, grid, folder)
+            _write_figures(arrays, setup, folder)
     return labels.path
 
 
@@ -82,7 +79,7 @@ def _counted(batches: Iterator[Batch], total: int, what: str) -> Iterator[Batch]
             shown.update(len(batch["heights"]))
 
 
-def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, out: Path) -> None:
+def _write_figures(maps: Batch, setup: Setup, out: Path) -> None:
     """Draws and writes the labels of a few maps, the robot and the action space."""
     from travjax.evaluation import map_figures  # matplotlib takes 0.3 s to import
 
@@ -90,9 +87,7 @@ def _write_figures(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid, 
     titles = [title(maps, index) for index in chosen]
     heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
     progress.wrote(
-        map_figures.save(
-            map_figures.labelled_maps(heights, failed, known, titles, robot, actions, grid), out / "labels.png"
-        )
+        map_figures.save(map_figures.labelled_maps(heights, failed, known, titles, setup), out / "labels.png")
     )
-    progress.wrote(map_figures.save(map_figures.robot_figure(robot), out / "robot.png"))
-    progress.wrote(map_figures.save(map_figures.action_figure(actions, robot, grid), out / "actions.png"))
+    progress.wrote(map_figures.save(map_figures.robot_figure(setup.robot), out / "robot.png"))
+    progress.wrote(map_figures.save(map_figures.action_figure(setup), out / "actions.png"))

@@ -24,10 +24,8 @@ from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, output_folder
 from travjax.simulation import reference
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, packed, simulate
+from travjax.simulation.setup import Setup
+from travjax.simulation.traverse import failures, margins_of, packed
 from travjax.terrain.styles import STYLES, generate_terrain
 
 COLUMNS = {
@@ -64,8 +62,9 @@ def processor() -> str:
     return next(iter(named), "") or platform.processor() or platform.machine()
 
 
-def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
+def check(setup: Setup) -> None:
     """Raises InputError when the sequential simulator refuses robot, actions and grid that `node_table` accepts."""
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     try:
         for trajectory in range(0, len(actions), len(actions.radii) ** 2):
             reference.simulate_trajectory(np.zeros(grid.shape), robot, actions, trajectory, grid.spacing)
@@ -73,26 +72,24 @@ def check(robot: Robot, actions: ActionSpace, grid: Grid) -> None:
         raise InputError(f"sequential simulator: {' '.join(str(error).split())}") from None
 
 
-def measure(
-    robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15, stream: int = 0
-) -> None:
+def measure(setup: Setup, out: str | Path, repeats: int = 15, stream: int = 0) -> None:
     """Measures terrain, labelling and the sequential simulator; prints the table and writes it as TSV and a figure.
 
     repeats: number of timed calls; the median is reported
     stream:  number of maps to make and label in a stream as well, 0 for none
     Raises InputError as `check` does, and when nothing can be written to `out`.
     """
-    check(robot, actions, grid)
+    check(setup)
     folder, rows = output_folder(out), [start_row()]
     # First calls must compile rather than read the cache.
     jax.config.update("jax_enable_compilation_cache", False)
-    measured = kernel_rows(robot, actions, grid, repeats)
+    measured = kernel_rows(setup, repeats)
     rows += list(progress.bar("kernels", 2 * len(BATCHES), "row", iterable=measured))
-    with progress.bar("sequential simulator", len(actions), "trajectory") as bar:
-        rows.append(reference_row(robot, actions, grid, lambda done: bar.update(done - bar.n)))
+    with progress.bar("sequential simulator", len(setup.actions), "trajectory") as bar:
+        rows.append(reference_row(setup, lambda done: bar.update(done - bar.n)))
     if stream:
         with progress.bar("stream", stream, "map") as bar:
-            rows.append(stream_row(stream, robot, actions, grid, bar.update))
+            rows.append(stream_row(stream, setup, bar.update))
     rows = with_speed_up(rows)
     write_rows(rows, COLUMNS, folder / "bench.tsv")
     kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
@@ -107,30 +104,29 @@ def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
     progress.wrote(path)
 
 
-def kernel_rows(robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> Iterator[dict]:
+def kernel_rows(setup: Setup, repeats: int) -> Iterator[dict]:
     """Measures terrain and labelling on compiled code, and yields a row for each batch size."""
     for maps in BATCHES:
         styles, seeds = _mixture(0, maps)
-        make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=grid)
+        make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=setup.grid)
         yield _timed("terrain", maps, make, repeats, 0)
     for maps in BATCHES:
-        yield labelling_row(maps, robot, actions, grid, repeats)
+        yield labelling_row(maps, setup, repeats)
 
 
-def labelling_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int) -> dict:
+def labelling_row(maps: int, setup: Setup, repeats: int) -> dict:
     """Measures labelling of this many maps at once, on compiled code."""
-    heights = generate_terrain(*_mixture(0, maps), grid=grid)
+    heights = generate_terrain(*_mixture(0, maps), grid=setup.grid)
     heights = heights[0] if maps == 1 else heights
-    return _timed("labelling", maps, lambda: simulate(heights, robot, actions, grid=grid), repeats, len(actions))
+    return _timed("labelling", maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
 
 
-def reference_row(
-    robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object], repeats: int = 1
-) -> dict:
+def reference_row(setup: Setup, on_progress: Callable[[int], object], repeats: int = 1) -> dict:
     """Measures the sequential simulator on all trajectories of one map.
 
     on_progress: called with the number of trajectories of a call that are done
     """
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     heights = np.asarray(generate_terrain("rough", [0], grid=grid)[0], np.float64)
     seconds = []
     for _ in range(repeats):
@@ -140,17 +136,17 @@ def reference_row(
     return _row(SEQUENTIAL, 1, statistics.median(seconds), len(actions), None, repeats)
 
 
-def stream_row(maps: int, robot: Robot, actions: ActionSpace, grid: Grid, on_progress: Callable[[int], object]) -> dict:
+def stream_row(maps: int, setup: Setup, on_progress: Callable[[int], object]) -> dict:
     """Measures generating and labelling maps in chunks, with labels kept in memory at one byte per trajectory."""
-    labels = np.empty((maps, len(actions)), np.uint8)
+    labels = np.empty((maps, len(setup.actions)), np.uint8)
     start = time.perf_counter()
     for first in range(0, maps, STREAM_CHUNK):
         count = min(STREAM_CHUNK, maps - first)
-        heights = generate_terrain(*_mixture(first, count), grid=grid)
-        margins = simulate(heights, robot, actions, grid=grid)
-        labels[first : first + count] = packed(failures(margins, robot), margins.known)
+        heights = generate_terrain(*_mixture(first, count), grid=setup.grid)
+        margins = margins_of(heights, setup)
+        labels[first : first + count] = packed(failures(margins, setup.robot), margins.known)
         on_progress(count)
-    return _row("terrain and labelling, streamed", maps, time.perf_counter() - start, len(actions), None, 1)
+    return _row("terrain and labelling, streamed", maps, time.perf_counter() - start, len(setup.actions), None, 1)
 
 
 def start_row() -> dict:

@@ -139,11 +139,11 @@ def run(arguments: argparse.Namespace) -> None:
         resnet.require_trained_for(trained.robot, trained.actions, trained.grid)
     sites = _sites(arguments.sites, wanted)
     out = output_folder(arguments.out)
-    seed, named = arguments.seed, (trained.robot, trained.actions, trained.grid)
+    seed = arguments.seed
     real, parts = {}, []
     if sites:
         with progress.bar("windows of sites", None, "window") as bar:
-            real = of_sites(sites, arguments.windows, seed, *named, bar.update)
+            real = of_sites(sites, arguments.windows, seed, trained.setup, bar.update)
     validation = _synthetic("validation", arguments.validation_maps, seed + 1, field)
     chosen = best_filters(validation, seed)
     if wanted != REAL:
@@ -179,17 +179,16 @@ def _sites(given: str | None, ground: str) -> SitesConfig | None:
 
 
 def _synthetic(what: str, count: int, seed: int, field: Predictor) -> BenchmarkMaps:
-    trained = field.run
     with progress.bar(f"{what} maps", count, "map") as bar:
-        return BenchmarkMaps.synthetic(count, seed, trained.robot, trained.actions, trained.grid, bar.update)
+        return BenchmarkMaps.synthetic(count, seed, field.run.setup, bar.update)
 
 
 def times(field: Predictor, resnet: Predictor | None, repeats: int) -> list[dict]:
     """Returns rows of experiments/timing.py for the simulators and the ResNet50, and two for the hazard field."""
     trained = field.run
     trunk = resnet.run.preset.trunk if resnet else ResNetConfig()
-    rows = timing.measured(trained.robot, trained.actions, trained.grid, trunk, 64, repeats)
-    maps = BenchmarkMaps.synthetic(8, SEED, trained.robot, trained.actions, trained.grid).heights
+    rows = timing.measured(trained.setup, trunk, 64, repeats)
+    maps = BenchmarkMaps.synthetic(8, SEED, trained.setup).heights
     for count in (1, len(maps)):
         field.predict(maps[:count])
         taken = []

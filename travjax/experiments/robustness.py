@@ -19,11 +19,10 @@ from travjax.devices import Devices
 from travjax.estimators.inference import Placed, probabilities
 from travjax.evaluation.metrics import OVERALL, Confusion, average_precision, confusions
 from travjax.runs.predictor import Predictor
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import EVENTS
-from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import simulate
+from travjax.simulation.setup import Setup
+from travjax.simulation.traverse import margins_of
 
 Maps = Float[np.ndarray, "n rows cols"]
 Fails = Float[np.ndarray, "*m k"]
@@ -82,36 +81,32 @@ class BenchmarkMaps:
     known: Bool[np.ndarray, "n t"]
     failed: Bool[np.ndarray, "n t k"]
     margins: Float[np.ndarray, "n t k"]
-    robot: Robot
-    actions: ActionSpace
-    grid: Grid
+    setup: Setup
 
     @staticmethod
     def synthetic(
         count: int,
         seed: int,
-        robot: Robot,
-        actions: ActionSpace,
-        grid: Grid,
+        setup: Setup,
         on_progress: Progress = lambda count: None,
     ) -> "BenchmarkMaps":
         """Makes maps of all styles as a data set of that size and seed draws them; on_progress: is told of maps."""
         config, batches = DatasetConfig(count, seed), []
-        for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), grid):
-            batches.append(labelled(batch, robot, actions, grid))
+        for batch in synthetic_batches(config.styles().tolist(), config.seeds().tolist(), setup.grid):
+            batches.append(labelled(batch, setup))
             on_progress(len(batch["heights"]))
-        return BenchmarkMaps._from_batch(joined(batches), robot, actions, grid)
+        return BenchmarkMaps._from_batch(joined(batches), setup)
 
     @staticmethod
-    def real(heights: Maps, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
+    def real(heights: Maps, setup: Setup) -> "BenchmarkMaps":
         """Labels windows of real maps; heights: [n, rows, cols] metres, NaN unknown."""
-        return BenchmarkMaps._from_batch(labelled({"heights": heights}, robot, actions, grid), robot, actions, grid)
+        return BenchmarkMaps._from_batch(labelled({"heights": heights}, setup), setup)
 
     @staticmethod
-    def _from_batch(maps: Batch, robot: Robot, actions: ActionSpace, grid: Grid) -> "BenchmarkMaps":
-        margins = np.stack([maps[event] for event in robot.event_names], axis=-1)
+    def _from_batch(maps: Batch, setup: Setup) -> "BenchmarkMaps":
+        margins = np.stack([maps[event] for event in setup.robot.event_names], axis=-1)
         heights = sensor_noise.filled(maps["heights"])
-        return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, robot, actions, grid)
+        return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, setup)
 
     def seen(self, name: str, seed: int) -> Maps:
         """Returns the maps with one of CORRUPTIONS, the same each time for a seed."""
@@ -120,8 +115,8 @@ class BenchmarkMaps:
 
     def simulated(self, maps: Maps) -> Fails:
         """Returns the simulator's verdict on maps: 1 where a trajectory fails, else 0."""
-        margins = simulate(maps, self.robot, self.actions, grid=self.grid).events()
-        return (np.asarray(margins) > np.asarray(self.robot.limits, np.float32)).astype(np.float32)
+        margins = margins_of(maps, self.setup).events()
+        return (np.asarray(margins) > np.asarray(self.setup.robot.limits, np.float32)).astype(np.float32)
 
     def best_filter(self, maps: Maps, on_progress: Progress = lambda count: None) -> str:
         """Returns the name in FILTERS of the filter that gives the simulator the largest F1 on these corrupted maps."""
@@ -133,16 +128,14 @@ class BenchmarkMaps:
 
     def scores(self, fails: Fails, threshold: float = 0.5) -> dict[str, Confusion]:
         """Returns the confusion of each event, and of all pooled, over the known trajectories; fails: [n, t, k]."""
-        return scores(fails[self.known], self.failed[self.known], threshold, self.robot.event_names)
+        return scores(fails[self.known], self.failed[self.known], threshold, self.setup.robot.event_names)
 
 
 def of_sites(
     config: SitesConfig,
     most: int,
     seed: int,
-    robot: Robot,
-    actions: ActionSpace,
-    grid: Grid,
+    setup: Setup,
     on_progress: Progress = lambda count: None,
 ) -> dict[str, BenchmarkMaps]:
     """Returns the windows of each site by name: all that are sufficiently known, or `most` drawn at random.
@@ -151,12 +144,12 @@ def of_sites(
     Raises InputError when a file is missing, cannot be read or leaves no window.
     """
     whole = (replace(site, split="test", test_strip=(), validation_strip=()) for site in config.site)
-    data = sites.read(replace(config, site=tuple(whole), rotations=False), robot, actions, grid, on_progress)
+    data = sites.read(replace(config, site=tuple(whole), rotations=False), setup, on_progress)
     grounds = {}
     for number, site in enumerate(config.site):
         own, rng = np.flatnonzero(data.group == site.group), np.random.default_rng((seed, number))
         chosen = np.sort(rng.choice(own, min(most, len(own)), replace=False))
-        grounds[site.group] = BenchmarkMaps.real(data.heights[chosen], robot, actions, grid)
+        grounds[site.group] = BenchmarkMaps.real(data.heights[chosen], setup)
     return grounds
 
 

@@ -65,7 +65,7 @@ def compare(
 ) -> dict:
     """Returns for every corruption its filter and the confusions and average precisions of every method."""
     results: dict[str, dict] = {}
-    drawn, events = _drawn(test, samples, seed), test.robot.event_names
+    drawn, events = _drawn(test, samples, seed), test.setup.robot.event_names
     methods = 3 + (resnet is not None)
     with progress.bar("corruptions", len(CORRUPTIONS) * methods, "method") as bar:
         for name in CORRUPTIONS:
@@ -75,7 +75,7 @@ def compare(
                 SIMULATOR: (test.simulated(seen), test.failed),
                 FILTERED: (test.simulated(FILTERS[chosen[name]](seen)), test.failed),
                 HAZARD: (predicted.probability, test.failed),
-                MARGINS: (by_margins(_margins(predicted.margins), test.robot), test.failed),
+                MARGINS: (by_margins(_margins(predicted.margins), test.setup.robot), test.failed),
             }
             bar.update(3)
             if resnet:
@@ -108,10 +108,10 @@ def _scored(fails: np.ndarray, failed: np.ndarray, events: Sequence[str]) -> dic
 
 def _on_clean_maps(test: BenchmarkMaps, validation: BenchmarkMaps, field: Predictor, predicted: Predicted) -> dict:
     """Returns the threshold for RECALL, chosen on validation maps, and the errors of the margins."""
-    events = test.robot.event_names
+    events = test.setup.robot.event_names
     probability = field.predict(validation.heights).probability
     threshold = metrics.threshold_for_recall(probability.ravel(), validation.failed.ravel(), RECALL)
-    largest = LARGE_MARGIN * np.asarray(test.robot.limits)
+    largest = LARGE_MARGIN * np.asarray(test.setup.robot.limits)
     off = np.minimum(_margins(predicted.margins), largest) - np.minimum(test.margins, largest)
     return {
         "threshold": threshold,
@@ -135,7 +135,7 @@ def _of_site(ground: BenchmarkMaps, field: Predictor, seed: int, on_progress: Pr
             on_progress(1)
         predicted = field.predict(seen)
         by_method[HAZARD] = ground.scores(predicted.probability)
-        by_method[MARGINS] = ground.scores(by_margins(_margins(predicted.margins), ground.robot))
+        by_method[MARGINS] = ground.scores(by_margins(_margins(predicted.margins), ground.setup.robot))
         on_progress(2)
         found[name] = by_method
     return found

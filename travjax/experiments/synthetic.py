@@ -21,7 +21,6 @@ from travjax.files import find_preset, held, user_path
 from travjax.runs.run import Run
 from travjax.runs.run_log import read_rows
 from travjax.signals import going_on
-from travjax.simulation.traverse import as_in_paper
 from travjax.training.evaluation_report import evaluate_run
 from travjax.training.fit import fit
 
@@ -90,7 +89,7 @@ def _pieces(wanted: Run, scores: Evaluation, folder: Path) -> list[launch.Piece]
 
 def _beside_the_paper(wanted: Run, ours: Confusion) -> list[str]:
     """Returns one line on all events pooled, if robot and action space are the paper's."""
-    if not as_in_paper(wanted.robot, wanted.actions):
+    if not wanted.setup.as_in_paper:
         return []
     shown = lambda value: "-" if math.isnan(value) else f"{value:.3f}"
     paper = PAPER_SYNTHETIC[OVERALL]

@@ -22,8 +22,7 @@ from travjax.experiments import launch
 from travjax.files import atomic_write, find_preset, output_folder
 from travjax.resnet.network import ResNetConfig
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.training.network_benchmark import BATCH, Bench
 
 COLUMNS = {
@@ -77,40 +76,41 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run(arguments: argparse.Namespace) -> None:
     """Measures, and writes the table, a figure and the report."""
-    grid, robot, actions = options.setup(arguments)
+    setup = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     require(arguments.batch > 0, "--batch", arguments.batch, "at least 1")
     Devices.all().check_batch(arguments.batch)
-    simulator_benchmark.check(robot, actions, grid)
+    simulator_benchmark.check(setup)
     trunk = ResNetConfig()
     if arguments.network:
         trunk = Preset.load(find_preset(arguments.network, RESNET)).trunk
     out = output_folder(arguments.out)
-    rows = _of_paper() if actions == ActionSpace() else []
-    rows += measured(robot, actions, grid, trunk, arguments.batch, arguments.repeats)
-    _write(rows, f"{robot.name}, {len(actions)} trajectories of a map; {simulator_benchmark.machine()}", out)
+    rows = _of_paper() if setup.actions == ActionSpace() else []
+    rows += measured(setup, trunk, arguments.batch, arguments.repeats)
+    _write(
+        rows, f"{setup.robot.name}, {len(setup.actions)} trajectories of a map; {simulator_benchmark.machine()}", out
+    )
 
 
-def measured(
-    robot: Robot, actions: ActionSpace, grid: Grid, trunk: ResNetConfig, batch: int, repeats: int
-) -> list[dict]:
+def measured(setup: Setup, trunk: ResNetConfig, batch: int, repeats: int) -> list[dict]:
     """Measures each method on all trajectories of a map on this device, with progress bars; returns the rows."""
-    with progress.bar(SEQUENTIAL, repeats * len(actions), "trajectory") as bar:
-        row = simulator_benchmark.reference_row(robot, actions, grid, lambda done: bar.update(), repeats)
+    trajectories = len(setup.actions)
+    with progress.bar(SEQUENTIAL, repeats * trajectories, "trajectory") as bar:
+        row = simulator_benchmark.reference_row(setup, lambda done: bar.update(), repeats)
     sequential = row["ms_per_map"] / 1e3
     rows = [
-        _row(SEQUENTIAL, f"{simulator_benchmark.processor()}, one core", sequential, len(actions), sequential, repeats)
+        _row(SEQUENTIAL, f"{simulator_benchmark.processor()}, one core", sequential, trajectories, sequential, repeats)
     ]
 
     def others() -> Iterator[dict]:
         device = _device()
         for maps in (1, TOGETHER):
-            row = simulator_benchmark.labelling_row(maps, robot, actions, grid, repeats)
+            row = simulator_benchmark.labelling_row(maps, setup, repeats)
             what = f"batched simulator, {maps} map{'s at once' if maps > 1 else ''}"
-            yield _row(what, device, row["ms_per_map"] / 1e3, len(actions), sequential, repeats)
-        row = Bench(robot, actions, grid, repeats, trunk).all_trajectories(batch, repeats)
+            yield _row(what, device, row["ms_per_map"] / 1e3, trajectories, sequential, repeats)
+        row = Bench(setup, repeats, trunk).all_trajectories(batch, repeats)
         what = f"{NETWORK}, {trunk.dtype}, batches of {batch}"
-        yield _row(what, device, row["ms"] / 1e3, len(actions), sequential, repeats)
+        yield _row(what, device, row["ms"] / 1e3, trajectories, sequential, repeats)
 
     return rows + list(progress.bar("batched simulator, network", 3, "row", iterable=others()))
 

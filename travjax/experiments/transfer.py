@@ -166,7 +166,7 @@ def _data(sites: Path, given: Path | None, base: Run, out: Path, stand_ins: Stan
     if stand_ins:
         stand_ins.write()
     config = stand_ins.sites if stand_ins else SitesConfig.load(sites)
-    return build_from_sites(config, base.robot, base.actions, base.grid, out / DATA)
+    return build_from_sites(config, base.setup, out / DATA)
 
 
 def _write(transfer: Transfer, results: Results, out: Path, stand_ins: StandIns | None) -> None:
@@ -243,9 +243,7 @@ def _maps_figure(transfer: Transfer) -> Figure:
     failed, known = map(np.asarray, unpacked(data.labels[shown], base.robot))
     places = data.provenance.origin[shown] if data.provenance else shown
     titles = [f"{config.shown}, SW {np.round(place, 1).tolist()}" for place in places]
-    return map_figures.predicted_maps(
-        data.heights[shown], predictions, failed, known, titles, base.robot, base.actions, base.grid
-    )
+    return map_figures.predicted_maps(data.heights[shown], predictions, failed, known, titles, base.setup)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

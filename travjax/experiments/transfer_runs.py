@@ -14,7 +14,7 @@ import numpy as np
 from flax import nnx
 
 from travjax.config import InputError, require
-from travjax.data.dataset import Dataset, require_matching
+from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples, natural_sample
 from travjax.devices import Devices
 from travjax.estimators.preset import MOST, TrainingConfig, find_weights
@@ -98,7 +98,7 @@ class Transfer:
     ):
         self.config, self.base, self.synthetic, self.dataset = config, base, synthetic, dataset
         self.folder, self.devices = folder, devices
-        require_matching(dataset, base.robot, base.actions, base.grid)
+        dataset.setup.require_same(base.setup, "data set")
         self.held_out = _held_out(dataset, config)
         if config.shown_maps:
             allowed = f"a held-out site, {', '.join(self.held_out)}, or shown_maps 0"

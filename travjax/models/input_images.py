@@ -27,11 +27,10 @@ from travjax.files import cache_folder, save_npz
 from travjax.jax_flags import usual_flags
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.arrays import integers
-from travjax.simulation.footprint import node_table
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import chosen_actions, chosen_robot
+from travjax.simulation.setup import Setup
 
 CHANNELS = ("elevation", "trajectory", "wheels")
 
@@ -72,17 +71,17 @@ def render_inputs(
     not above 0.
     """
     maps, _ = as_maps(heights, grid)
-    robot, actions = chosen_robot(robot), chosen_actions(actions)
+    setup = Setup.chosen(robot, actions, grid)
     require_number("elevation_scale", elevation_scale, 0, np.inf, "a length in metres above 0")
-    node_table(robot, actions, grid)  # raises where they do not fit together
+    setup.node_table()  # raises where robot, actions and grid do not fit together
     of_map = _checked_index("map_index", map_index, len(maps))
-    of_trajectory = _checked_index("trajectory_index", trajectory_index, len(actions))
+    of_trajectory = _checked_index("trajectory_index", trajectory_index, len(setup.actions))
     if of_map.ndim and of_trajectory.ndim and of_map.shape != of_trajectory.shape:
         raise InputError(
             f"map_index, trajectory_index: {of_map.size} and {of_trajectory.size} samples: must be as many of both"
         )
     drawn, place = np.unique(of_trajectory, return_inverse=True)
-    channels = trajectory_channels(robot, actions, grid, drawn)
+    channels = trajectory_channels(setup, drawn)
     of_map, place = np.broadcast_arrays(of_map, place.reshape(of_trajectory.shape))
     images = assemble(maps, channels, np.atleast_1d(of_map), np.atleast_1d(place), elevation_scale)
     return images if of_map.ndim else images[0]
@@ -110,16 +109,14 @@ class ImageSource:
     @staticmethod
     def from_maps(
         heights: Float[np.ndarray, "n rows cols"],
-        robot: Robot,
-        actions: ActionSpace,
-        grid: Grid,
+        setup: Setup,
         elevation_scale: float,
         on_progress: Callable[[int], object] = lambda count: None,
     ) -> "ImageSource":
         """Makes the source of all trajectories on maps; the arguments are those of `trajectory_bank`, which it
         calls.
         """
-        bank = trajectory_bank(robot, actions, grid, on_progress=on_progress)
+        bank = trajectory_bank(setup, on_progress=on_progress)
         return ImageSource(heights, bank, np.float32(elevation_scale))
 
     def images(self, map_index: Int[Array, " b"], trajectory_index: Int[Array, " b"]) -> Float[Array, "b rows cols 3"]:
@@ -160,9 +157,7 @@ def elevation_channel(
 
 
 def trajectory_bank(
-    robot: Robot,
-    actions: ActionSpace,
-    grid: Grid,
+    setup: Setup,
     *,
     cache: Path | None = None,
     on_progress: Callable[[int], object] = lambda count: None,
@@ -173,6 +168,7 @@ def trajectory_bank(
            is made again, and nothing is kept where the folder cannot be written to or there is no cache
     on_progress: is told how many trajectories were added
     """
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     configuration = repr((FORMAT, robot.track, robot.wheelbase, robot.wheel_width, actions, grid))
     name = f"bank-{hashlib.sha256(configuration.encode()).hexdigest()[:16]}.npz"
     folder = cache_folder() if cache is None else cache
@@ -184,7 +180,7 @@ def trajectory_bank(
     block = len(actions.radii) ** 2
     for start in range(0, len(actions), block):
         numbers = np.arange(start, start + block)
-        bank[numbers] = trajectory_channels(robot, actions, grid, numbers)
+        bank[numbers] = trajectory_channels(setup, numbers)
         on_progress(block)
     if folder:
         with suppress(InputError, OSError):  # it is made again next time
@@ -204,10 +200,9 @@ def _read_bank(path: Path, configuration: str) -> np.ndarray | None:
 
 
 @usual_flags()
-def trajectory_channels(
-    robot: Robot, actions: ActionSpace, grid: Grid, trajectories: Int[np.ndarray, " k"]
-) -> UInt8[np.ndarray, "k rows cols 2"]:
+def trajectory_channels(setup: Setup, trajectories: Int[np.ndarray, " k"]) -> UInt8[np.ndarray, "k rows cols 2"]:
     """Draws channels 2 and 3 of some trajectories, with 255 for 1; a first arc is drawn once for all that share it."""
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     turn, first, second = actions.split(np.asarray(trajectories))
     starts = actions.first_poses(turn, first)[:, [0, -1]]  # where the first and the second arc start
     widths = (robot.track / 2, robot.wheel_width / 2)

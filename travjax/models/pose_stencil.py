@@ -11,10 +11,10 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from travjax.simulation.actions import ActionSpace, arc_poses
-from travjax.simulation.footprint import nearest, node_table
+from travjax.simulation.actions import arc_poses
+from travjax.simulation.footprint import nearest
 from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 ACROSS, ALONG = 2, 5
 """Places under the chassis, evenly spread over its width and length."""
@@ -42,27 +42,29 @@ class Stencil:
 
 
 @lru_cache(maxsize=8)
-def stencil(robot: Robot, actions: ActionSpace, grid: Grid) -> Stencil:
+def stencil(setup: Setup) -> Stencil:
     """Builds the table; raises InputError when a trajectory leaves the map or turns inside the robot."""
-    node_table(robot, actions, grid)  # checks that they fit together
-    radii = np.asarray(actions.radii)
+    setup.node_table()  # checks that robot, actions and grid fit together
+    actions, radii = setup.actions, np.asarray(setup.actions.radii)
     every = np.arange(len(radii))
     turn, first = np.divmod(np.arange(actions.turns * len(radii)), len(radii))
     own = actions.first_poses(turn, first)
     following = actions.second_poses(turn[:, None], first[:, None], every)
-    parts = [nodes_at(own, radii[first][:, None], robot, actions, grid)]
-    parts.append(nodes_at(following, radii[:, None], robot, actions, grid))
+    parts = [nodes_at(own, radii[first][:, None], setup)]
+    parts.append(nodes_at(following, radii[:, None], setup))
     nodes = np.concatenate([part.reshape(len(turn), -1, STENCIL_NODES) for part in parts], axis=1)
     nodes.setflags(write=False)
     return Stencil(nodes, own.shape[1], len(radii))
 
 
-def nodes_at(poses: np.ndarray, radius: np.ndarray, robot: Robot, actions: ActionSpace, grid: Grid) -> Nodes:
+def nodes_at(poses: np.ndarray, radius: np.ndarray, setup: Setup) -> Nodes:
     """Returns the stencils of poses [..., 3] on arcs of signed radius [...]: [..., s] int32.
 
     Places off the map are moved to its edge. The pose before is always on the same arc, at the junction as well.
     """
-    before = arc_poses(poses, np.broadcast_to(radius, poses.shape[:-1]), np.array([-actions.interval]))[..., 0, :]
+    robot, grid = setup.robot, setup.grid
+    back = np.array([-setup.actions.interval])
+    before = arc_poses(poses, np.broadcast_to(radius, poses.shape[:-1]), back)[..., 0, :]
     wheels = np.array(robot.wheel_positions())
     right = robot.chassis_width * (np.arange(ACROSS) + 0.5 - ACROSS / 2) / ACROSS
     forward = robot.chassis_length * (np.arange(ALONG) + 0.5 - ALONG / 2) / ALONG

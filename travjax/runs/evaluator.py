@@ -9,7 +9,7 @@ import numpy as np
 
 from travjax.config import require
 from travjax.data import map_batches
-from travjax.data.dataset import Dataset, require_matching
+from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples, balanced_subset, every_sample, natural_sample
 from travjax.devices import Devices
 from travjax.estimators.inference import Placed, Progress, probabilities
@@ -17,7 +17,7 @@ from travjax.evaluation import metrics
 from travjax.evaluation.baselines import LogisticRegression, slope_and_step
 from travjax.models.variables import Network
 from travjax.runs.run import Run
-from travjax.simulation.traverse import as_in_paper, simulate, unpacked
+from travjax.simulation.traverse import margins_of, unpacked
 
 SPARSEST = 6
 """A figure shows at least every sixth trajectory."""
@@ -42,7 +42,7 @@ class Evaluator:
     @staticmethod
     def from_run(run: Run, dataset: Dataset, devices: Devices) -> "Evaluator":
         """Puts the network's source, made from the maps, on the devices."""
-        require_matching(dataset, run.robot, run.actions, run.grid)
+        dataset.setup.require_same(run.setup, "data set")
         devices.check_batch(run.preset.training.batch_size)
         source = run.source(dataset.heights)
         return Evaluator(run, dataset, devices.replicate(source), devices)
@@ -88,7 +88,7 @@ class Evaluator:
         margins = run.kind.of_maps(placed, maps, count, lambda done: on_progress(done // count))[1]
         largest = run.kind.largest_margin
         assert margins is not None and largest is not None
-        simulated = simulate(self.dataset.heights[maps], run.robot, run.actions, grid=run.grid).events()
+        simulated = margins_of(self.dataset.heights[maps], run.setup).events()
         true = np.asarray(simulated)[place, samples[1]] / np.asarray(run.robot.limits, np.float32)
         allowed = "known trajectories alone, as its labels say"
         require(bool(np.isfinite(true).all()), "data set, margins", "NaN", allowed)
@@ -133,7 +133,7 @@ class Evaluator:
     @property
     def paper(self) -> Mapping[str, metrics.Confusion] | None:
         """The paper's confusion matrices; None unless maps are synthetic and robot and action space are the paper's."""
-        compares = self.dataset.config and as_in_paper(self.run.robot, self.run.actions)
+        compares = self.dataset.config and self.run.setup.as_in_paper
         return metrics.PAPER_SYNTHETIC if compares else None
 
     def scores(self, probability: np.ndarray, samples: Samples, recalls: Sequence[float]) -> metrics.Evaluation:

@@ -9,7 +9,6 @@ from travjax.evaluation import metrics, tables
 from travjax.files import output_folder, save_text
 from travjax.npz_stream import NpzStream
 from travjax.runs.predictor import Predictor
-from travjax.simulation.setup import setup_json
 
 PROBABILITY = 0.5
 """Probability from which a trajectory counts as failing in the printed table."""
@@ -30,9 +29,9 @@ def predict_maps(
     Returns the .npz of the predictions. Raises InputError when they do not fit on the disk, or cannot be written.
     """
     folder, trained = output_folder(out), predictor.run
-    model, robot, actions, grid = trained.preset.model, trained.robot, trained.actions, trained.grid
-    config = setup_json(robot, actions, grid, files=maps.files, model=model, world=maps.world)
-    size = bytes_each(robot, actions, grid) + len(actions) * len(robot.events) * 2 * 4
+    model, setup, robot, actions = trained.preset.model, trained.setup, trained.robot, trained.actions
+    config = setup.to_json_text(files=maps.files, model=model, world=maps.world)
+    size = bytes_each(setup) + len(actions) * len(robot.events) * 2 * 4
     with NpzStream(folder / "predictions.npz", maps.total, size, "predicted maps") as predictions:
         with progress.bar("predicting", maps.total * len(actions), "trajectory") as bar:
             for batch in maps.batches:
@@ -44,7 +43,7 @@ def predict_maps(
         if check:
             text += f"\n\n{_checked(arrays, robot.event_names)}"
         unsaved = ("heights",) if check else ("heights", "failed")
-        saved = predictions.save(unsaved, config=config, cell_size=grid.spacing)
+        saved = predictions.save(unsaved, config=config, cell_size=trained.grid.spacing)
         shares = save_text(folder / "shares.txt", f"{text}\n")
         progress.say(f"\n{text}\n")
         progress.wrote(saved, shares)
@@ -56,7 +55,7 @@ def predict_maps(
 def _predicted(batch: Batch, predictor: Predictor, on_progress: Callable[[int], object]) -> Batch:
     """Adds the predictions to a batch, and from the simulator the failures and which trajectories are known."""
     trained = predictor.run
-    simulated = labelled(batch, trained.robot, trained.actions, trained.grid)
+    simulated = labelled(batch, trained.setup)
     predicted = predictor.predict(batch["heights"], on_progress)
     kept = ("heights", "group", "known", "failed", "origin", "height_offset", "crs", "seed")
     found = {name: simulated[name] for name in kept if name in simulated} | {"probability": predicted.probability}
@@ -86,9 +85,7 @@ def _figure(maps: Batch, predictor: Predictor, check: bool, out: Path) -> Path:
         maps["failed"][shown] if check else None,
         maps["known"][shown],
         titles,
-        trained.robot,
-        trained.actions,
-        trained.grid,
+        trained.setup,
         SIMULATOR,
     )
     return map_figures.save(figure, out / "predictions.png")

@@ -18,6 +18,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 
 WEIGHTS = Path(__file__).parent / "weights"
 """The estimators that come with the package."""
@@ -74,13 +75,14 @@ class Predictor:
         """Raises InputError when robot, actions or grid differ from what the estimator was trained for; it names
         both.
         """
-        run = self.run
-        if robot:
-            same = " of other dimensions or limits" if robot.name == run.robot.name else ""
-            allowed = f"{run.robot.name}{same}, which the estimator was trained for"
-            require(robot == run.robot, "robot", robot.name, allowed)
-        for name, given, own in (("actions", actions, run.actions), ("grid", grid, run.grid)):
-            require(given in (None, own), name, given, f"{own}, which the estimator was trained for")
+        own = self.run.setup
+        given = Setup(robot or own.robot, actions or own.actions, grid or own.grid)
+        for part, *_ in own.differences(given):
+            wanted, other = getattr(own, part), getattr(given, part)
+            if part == "robot":
+                same = " of other dimensions or limits" if other.name == wanted.name else ""
+                wanted, other = f"{wanted.name}{same}", other.name
+            require(False, part, other, f"{wanted}, which the estimator was trained for")
 
     @usual_flags()
     def predict(self, heights: Heights, on_progress: Progress = lambda count: None) -> Predicted:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from travjax.runs.checkpoint import Checkpoints
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import PARTS, Setup
 
 COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
 """Fields of the training position that a checkpoint records: whole numbers, and other numbers."""
@@ -32,20 +34,31 @@ COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
 DATA = "data"
 """Name of the folder that holds a run's own data set."""
 
-_PARTS = {"preset": Preset, "robot": Robot, "actions": ActionSpace, "grid": Grid}
-
 
 @dataclass(frozen=True)
 class Run:
     """What a training run is made from.
 
-    robot, actions, grid: those that the labels, and so the network, are made for
+    setup: robot, action space and grid that the labels, and so the network, are made for
     """
 
     preset: Preset
-    robot: Robot
-    actions: ActionSpace
-    grid: Grid
+    setup: Setup
+
+    @property
+    def robot(self) -> Robot:
+        """The robot of the setup."""
+        return self.setup.robot
+
+    @property
+    def actions(self) -> ActionSpace:
+        """The action space of the setup."""
+        return self.setup.actions
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the setup."""
+        return self.setup.grid
 
     def save(self, folder: Path) -> Path:
         """Writes run.json."""
@@ -53,7 +66,7 @@ class Run:
 
     def to_json(self) -> dict[str, Any]:
         """Converts the run to what JSON can hold."""
-        return {name: to_json(getattr(self, name)) for name in _PARTS}
+        return {"preset": to_json(self.preset)} | self.setup.to_json()
 
     @staticmethod
     def from_json(table: Any, where: object = "saved settings") -> "Run":
@@ -61,7 +74,8 @@ class Run:
 
         Raises InputError for any other table.
         """
-        return Run(**parts_from_json(table, _PARTS, where))
+        parts = parts_from_json(table, {"preset": Preset} | PARTS, where)
+        return Run(parts.pop("preset"), Setup(**parts))
 
     @staticmethod
     def load(folder: str | Path) -> "Run":
@@ -76,8 +90,9 @@ class Run:
     def require_same_settings(self, other: "Run", what: str) -> None:
         """Raises InputError that names the first setting in which the other run differs."""
         free = {f"preset.{name}" for name in ("robot", "weights", "evaluation.maps", "evaluation.trajectories_per_map")}
-        for name, mine, others in _settings(self, other):
-            if mine != others and name not in free:
+        parts = [(f"{part}.{name}", *values) for part, name, *values in self.setup.differences(other.setup)]
+        for name, mine, others in [*_differences(self.preset, other.preset, "preset."), *parts]:
+            if name not in free:
                 raise InputError(f"{what}: {name} = {shown(others)}: must be {shown(mine)}, as in the run so far")
 
     @property
@@ -95,7 +110,7 @@ class Run:
 
     def source(self, heights: np.ndarray, on_progress: Progress = lambda count: None) -> Any:
         """Returns maps [n, rows, cols] in the form the estimator takes; on_progress counts the trajectories drawn."""
-        return self.kind.source(self.preset, heights, self.robot, self.actions, self.grid, on_progress)
+        return self.kind.source(self.preset, heights, self.setup, on_progress)
 
     @usual_flags()
     def graph(self) -> nnx.GraphDef:
@@ -122,12 +137,13 @@ class Run:
         return jax.tree.map(shaped, jax.eval_shape(state))
 
 
-def _settings(mine: Any, other: Any, prefix: str = ""):
+def _differences(mine: Any, other: Any, prefix: str) -> Iterator[tuple[str, Any, Any]]:
+    """Yields name, value here and value there for each setting in which another configuration differs."""
     for field in dataclasses.fields(mine):
         name, ours, theirs = prefix + field.name, getattr(mine, field.name), getattr(other, field.name)
         if dataclasses.is_dataclass(ours) and type(theirs) is type(ours):
-            yield from _settings(ours, theirs, f"{name}.")
-        else:
+            yield from _differences(ours, theirs, f"{name}.")
+        elif ours != theirs:
             yield name, ours, theirs
 
 

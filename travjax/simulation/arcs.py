@@ -137,7 +137,7 @@ def _changes(before: tuple[jax.Array, ...], after: tuple[jax.Array, ...]) -> tup
     return tuple(b - a for a, b in zip(before, after, strict=True))
 
 
-def margins_of(maxima: jax.Array, events: tuple[Event, ...]) -> Margins:
+def margins_from(maxima: jax.Array, events: tuple[Event, ...]) -> Margins:
     """Makes margins of the largest values of events and of the highest ground that is touched, [E + 1, n, t]."""
     *largest, highest = maxima
     known = highest < UNKNOWN_HEIGHT / 2

@@ -143,7 +143,7 @@ class Margins:
 class Where:
     """Where every trajectory reaches its margin of each event, in the order of the robot's events.
 
-    pose: [n, t, k] int32 number of the pose, as in ActionSpace.poses; -1 is the last pose of a point turn before its end
+    pose: [n, t, k] int32 number of the pose, as in ActionSpace.poses; negative before a turn ends
     node: [n, t, k, 2] int32 row and column on the map: the wheel's, the highest under the body, or the robot's centre
     Both are -1 where the trajectory is unknown; read `pose` together with Margins.known, since turns are negative too.
     """

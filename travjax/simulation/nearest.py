@@ -13,23 +13,21 @@ import jax.numpy as jnp
 import numpy as np
 
 from travjax.batching import rounded
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.arcs import (
     UNKNOWN_HEIGHT,
     Poses,
     above_centre,
     arc_maxima,
     by_trajectory,
-    margins_of,
+    margins_from,
     node_lanes,
     on_map,
     view_lanes,
     where_of,
 )
 from travjax.simulation.events import PAPER, Event, Margins, Nodes, Where, larger
-from travjax.simulation.footprint import RUN, Layout, chassis_places, node_table
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.simulation.footprint import RUN, Layout, chassis_places
+from travjax.simulation.setup import Setup
 
 FEW_MAPS = 2
 """For up to this many maps, RUN neighbouring nodes are read at once: the lanes alone do not fill a vector register."""
@@ -62,24 +60,20 @@ class _Chunks:
     singles: jax.Array
 
 
-def nearest_margins(
-    maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, where: bool = False
-) -> tuple[Margins, Where | None]:
-    """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
-    chunks, source = _device_tables(robot, actions, grid, len(maps), FEW_MAPS < len(maps) or where)
-    layout = node_table(robot, actions, grid).layout
+def nearest_margins(maps: jax.Array, setup: Setup, where: bool) -> tuple[Margins, Where | None]:
+    """Simulates every trajectory on a batch of maps [n, rows, cols]; `where` also finds where margins are reached."""
+    chunks, source = _device_tables(setup, len(maps), where or len(maps) > FEW_MAPS)
+    robot, layout = setup.robot, setup.node_table().layout
     return _simulate(maps, chunks, source, robot.wheelbase, robot.track, layout, robot.events, where)
 
 
 @lru_cache(maxsize=8)
-def _device_tables(
-    robot: Robot, actions: ActionSpace, grid: Grid, maps: int, single: bool
-) -> tuple[_Chunks, jax.Array]:
+def _device_tables(setup: Setup, maps: int, single: bool) -> tuple[_Chunks, jax.Array]:
     """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device.
 
     single: whether chassis nodes are read one by one, without runs
     """
-    table = node_table(robot, actions, grid)
+    table = setup.node_table()
     runs, singles = chassis_places(table.chassis, 1 if single else RUN)
     arcs = len(table.centre)
     if jax.default_backend() == "cpu":
@@ -138,7 +132,7 @@ def _simulate(
         return arc_maxima(poses, layout, events)
 
     maxima, places = jax.lax.map(simulate_chunk, chunks)
-    margins = margins_of(by_trajectory(maxima, source, len(maps)), events)
+    margins = margins_from(by_trajectory(maxima, source, len(maps)), events)
     if places is None:
         return margins, None
     places = jnp.stack([by_trajectory(places[:, part], source, len(maps)) for part in (0, 1)])

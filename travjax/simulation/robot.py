@@ -5,12 +5,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from travjax.config import InputError, load_toml, require, require_length, require_number
+from travjax.simulation.contact import require_contact
 from travjax.simulation.events import OPTIONAL, PAPER, Event
 
 PRESETS = Path(__file__).parent / "robots"
-
-CONTACTS = ("nearest", "tyre")
-"""The contact models: how wheels and body touch the ground (SPEC sections 5 and 15)."""
 
 LONGEST_NAME = 100
 """Characters that a robot's name may have at most."""
@@ -61,8 +59,8 @@ class Robot:
     def __post_init__(self):
         named = isinstance(self.name, str) and 0 < len(self.name) <= LONGEST_NAME and self.name.isprintable()
         require(named, "name", self.name, f"a non-empty text of one line, at most {LONGEST_NAME} characters")
-        chosen = (None, *CONTACTS)
-        require(self.contact in chosen, "contact", self.contact, " or ".join(map(repr, CONTACTS)))
+        if self.contact is not None:
+            require_contact(self.contact)
         for one in fields(self)[1:]:
             value = getattr(self, one.name)
             if one.name == "contact" or (value is None and "optional" in one.metadata):

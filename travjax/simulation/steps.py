@@ -1,10 +1,12 @@
 """The steps of a map: the height that a tyre must climb or drop at each node (SPEC section 15).
 
-heights -> gaps that a tyre bridges are closed -> rises that are steeper than the ground before and after them. A step
+heights -> gaps that a tyre bridges are filled -> rises that are steeper than the ground before and after them. A step
 belongs to the map and the wheel's radius, not to a direction of driving, so it is computed once for a map.
 """
 
 import math
+from collections.abc import Callable
+from functools import reduce
 from itertools import product
 
 import jax
@@ -14,50 +16,78 @@ from jaxtyping import Array, Float
 from travjax.simulation.grid import HIGHEST
 
 TIE = 1e-9
-"""Slack of bounds, as a share of the spacing."""
+"""Metres, slack of the wheel's radius."""
 
 DIRECTIONS = tuple(direction for direction in product((-1, 0, 1), repeat=2) if any(direction))
-"""The (row, col) offsets to the eight neighbours of a node."""
+"""The (row, col) offsets to the eight neighbours of a node; one of each opposite pair comes after the middle."""
 
-
-def step_heights(heights: Float[Array, "n r c"], radius: float, spacing: float) -> Float[Array, "n r c"]:
-    """Computes the step S of every node.
-
-    heights: metres, NaN or beyond grid.HIGHEST where unknown
-    radius:  metres, of the wheels; spacing: metres between nodes
-    Returns metres, at least 0; 0 where unknown. Source: SPEC section 15.
-    """
-    heights = jnp.where(jnp.abs(heights) <= HIGHEST, heights, jnp.nan)
-    closed = _closed(heights, nodes_within(radius, spacing))
-    # One pad holds all the neighbours that are read, two rises in every direction.
-    margin = 2 * nodes_within(radius, spacing)
-    padded = jnp.pad(closed, ((0, 0), (margin, margin), (margin, margin)), constant_values=jnp.nan)
-    rows, cols = heights.shape[1:]
-
-    def at(row: int, col: int) -> jax.Array:
-        return padded[:, margin + row : margin + row + rows, margin + col : margin + col + cols]
-
-    highest = jnp.zeros_like(heights)
-    for row, col in DIRECTIONS:
-        for n in range(1, nodes_within(radius, spacing * math.hypot(row, col)) + 1):
-            behind = at(-n * row, -n * col)
-            before, after = behind - at(-2 * n * row, -2 * n * col), at(n * row, n * col) - closed
-            slope = jnp.where(before > 0, before, 0)
-            slope = jnp.where(after > slope, after, slope)
-            excess = closed - behind - slope
-            highest = jnp.where(excess > highest, excess, highest)
-    return highest
+At = Callable[[int], jax.Array]
+"""Returns, for all nodes at once, the heights so many nodes further in one direction, NaN off the map."""
 
 
 def nodes_within(distance: float, spacing: float) -> int:
     """Returns how many nodes in a row lie within a distance, at least 1."""
-    return max(1, math.floor(distance / spacing + TIE))
+    return max(1, math.floor((distance + TIE) / spacing))
 
 
-def _closed(heights: jax.Array, size: int) -> jax.Array:
-    """Returns the smallest, over all squares of `size` nodes that contain a node, of their largest known heights."""
-    known = jnp.isfinite(heights)
-    window, strides, around = (1, size, size), (1, 1, 1), ((0, 0), (size - 1, size - 1), (size - 1, size - 1))
-    largest = jax.lax.reduce_window(jnp.where(known, heights, -jnp.inf), -jnp.inf, jax.lax.max, window, strides, around)
-    smallest = jax.lax.reduce_window(largest, jnp.inf, jax.lax.min, window, strides, "VALID")
-    return jnp.where(known, smallest, jnp.nan)
+def without_gaps(heights: Float[Array, "n r c"], radius: float, spacing: float) -> Float[Array, "n r c"]:
+    """Fills the trenches and holes of maps that a tyre bridges.
+
+    heights: metres, NaN or beyond grid.HIGHEST where unknown
+    radius:  metres, of the wheels; spacing: metres between nodes
+    Returns metres, NaN where unknown. Source: SPEC section 15.
+    """
+    heights = jnp.where(jnp.abs(heights) <= HIGHEST, heights, jnp.nan)
+    filled = heights
+    for at, count, _ in _lines(heights, radius, spacing, DIRECTIONS[4:], nodes_within(radius, spacing) + 1):
+        before, after = [_rim(at, -i) for i in range(1, count)], [_rim(at, i) for i in range(1, count)]
+        for i, j in product(range(1, count), repeat=2):
+            if i + j <= count:
+                level = jnp.minimum(before[i - 1], after[j - 1])  # NaN where a rim is unknown
+                filled = jnp.where(level > filled, level, filled)
+    return filled
+
+
+def _rim(at: At, k: int) -> jax.Array:
+    """Returns the height of the rim k nodes away, continued to here where it falls towards here."""
+    rim = at(k)
+    fall = rim - at(k + (1 if k > 0 else -1))
+    return rim + abs(k) * jnp.where(fall < 0, fall, 0)
+
+
+def step_heights(filled: Float[Array, "n r c"], radius: float, spacing: float) -> Float[Array, "n r c"]:
+    """Computes the step S of every node.
+
+    filled: metres, of `without_gaps`; radius, spacing: metres, as there
+    Returns metres, at least 0; 0 where unknown. Source: SPEC section 15.
+    """
+    highest = jnp.zeros_like(filled)
+    for at, count, distance in _lines(filled, radius, spacing, DIRECTIONS, 2 * nodes_within(radius, spacing)):
+        arriving = at(0) - at(-1)
+        for i, j in product(range(1, count + 1), range(count)):
+            n = i + j
+            if n > count:
+                continue
+            rise, before, after = at(j) - at(-i), at(-i) - at(-i - n), at(j + n) - at(j)
+            before, after = (jnp.where(jnp.isnan(a), b, a) for a, b in ((before, after), (after, before)))
+            slope = jnp.nan_to_num(jnp.maximum(before, after))
+            bank = jnp.maximum(jnp.nan_to_num(jnp.minimum(before, after)), n * distance)
+            excess = rise - jnp.minimum(jnp.maximum(slope, 0), bank)
+            parts = [at(k) - at(k - 1) for k in range(1 - i, j + 1) if k != 0]
+            steepest = reduce(jnp.logical_and, (arriving >= part for part in parts), True)
+            highest = jnp.where(steepest & (excess > highest), excess, highest)
+    return highest
+
+
+def _lines(heights: jax.Array, radius: float, spacing: float, directions, reach: int):
+    """Yields, for each direction, the heights along it, how many nodes lie within the radius, and their distance."""
+    rows, cols = heights.shape[1:]
+    padded = jnp.pad(heights, ((0, 0), (reach, reach), (reach, reach)), constant_values=jnp.nan)
+    for row, col in directions:
+
+        def at(k: int, row=row, col=col) -> jax.Array:
+            top, left = reach + k * row, reach + k * col
+            return padded[:, top : top + rows, left : left + cols]
+
+        distance = spacing * math.hypot(row, col)
+        yield at, nodes_within(radius, distance), distance

@@ -3,14 +3,13 @@
 heights -> margins of all trajectories, by one of the contact models (nearest.py, tyre.py) -> failures.
 """
 
-from functools import lru_cache, reduce
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, UInt8
 
 from travjax.batching import in_batches
-from travjax.config import require
 from travjax.jax_flags import usual_flags
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import UNKNOWN_LABEL, Margins, Where, label_bit
@@ -18,29 +17,8 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.nearest import nearest_margins
 from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup, chosen_robot
 from travjax.simulation.tyre import tyre_margins
-
-
-@lru_cache(maxsize=1)
-def default_robot() -> Robot:
-    """Returns the Seekur Jr, the paper's robot."""
-    return Robot.load("seekur_jr")
-
-
-def as_in_paper(robot: Robot, actions: ActionSpace) -> bool:
-    """Tells whether both are the paper's, so that figures on synthetic maps can be compared with the paper's."""
-    return robot == default_robot() and actions == ActionSpace()
-
-
-def chosen_robot(robot: Robot | str | None) -> Robot:
-    """Returns the default robot for None, else the robot that `Robot.load` makes of the argument."""
-    return default_robot() if robot is None else Robot.load(robot)
-
-
-def chosen_actions(actions: ActionSpace | None) -> ActionSpace:
-    """Returns the paper's action space for None, else the given one; raises InputError if it is no ActionSpace."""
-    require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
-    return ActionSpace() if actions is None else actions
 
 
 @usual_flags()
@@ -61,22 +39,38 @@ def simulate(
              float32, so a site at 2000 m loses nothing
     robot:   a Robot, or the name or file of one; the Seekur Jr unless given
     actions: the paper's action space unless given
-    Returns [n, t] arrays, or [t] for one map. Source: SPEC section 5.
+    contact: "nearest", the paper's contact model (SPEC section 5), or "tyre" (section 15); that of the robot's file unless
+             given, and "nearest" where it has none
+    turn:    whether `tyre` simulates the point turn at the start of a trajectory; `nearest` never does
+    where:   whether to return (Margins, Where): also the pose and the node at which each margin is reached
+    Returns [n, t] arrays, or [t] for one map.
     Raises InputError when heights do not have the grid's shape or are not numbers, when they are infinite, beyond 30 km
     or a common marker of unknown ground such as -9999 (in a jax array, whose values are not checked, such heights count
     as unknown), and when a trajectory leaves the map or turns inside the robot.
     """
-    maps, alone = as_maps(heights, grid)
-    robot, actions = chosen_robot(robot), chosen_actions(actions)
+    setup = Setup.chosen(robot, actions, grid, contact, turn)
+    return places_of(heights, setup) if where else margins_of(heights, setup)
 
-    def simulate_batch(batch: jax.Array) -> tuple[Margins, Where | None]:
-        if contact == "tyre":
-            return tyre_margins(batch, robot, actions, grid, turn, where)
-        return nearest_margins(batch, robot, actions, grid, where)
 
-    results = in_batches(simulate_batch, maps)
-    margins, places = jax.tree.map(lambda result: result[0], results) if alone else results
-    return (margins, places) if where else margins
+@usual_flags()
+def margins_of(heights: Heights, setup: Setup) -> Margins:
+    """Simulates every trajectory of a setup on every map; takes the heights and raises the errors of `simulate`."""
+    return _in_batches(heights, setup, where=False)[0]
+
+
+@usual_flags()
+def places_of(heights: Heights, setup: Setup) -> tuple[Margins, Where]:
+    """Simulates every trajectory, and also returns where it reaches its margins; otherwise as `margins_of`."""
+    margins, where = _in_batches(heights, setup, where=True)
+    assert where is not None
+    return margins, where
+
+
+def _in_batches(heights: Heights, setup: Setup, where: bool) -> tuple[Margins, Where | None]:
+    maps, alone = as_maps(heights, setup.grid)
+    simulate_batch = tyre_margins if setup.contact.model == "tyre" else nearest_margins
+    results = in_batches(lambda batch: simulate_batch(batch, setup, where), maps)
+    return jax.tree.map(lambda result: result[0], results) if alone else results
 
 
 @usual_flags()
@@ -97,13 +91,15 @@ def label(
     actions: ActionSpace | None = None,
     *,
     grid: Grid = Grid(),
+    contact: str | None = None,
+    turn: bool = True,
 ) -> Bool[Array, "*n t k"]:
-    """Tells which trajectories fail on every map; takes the arguments and raises the errors of `simulate`.
+    """Tells which trajectories fail on every map; takes the arguments of `simulate` and raises its errors.
 
     Returns [n, t, 3] for step, obstacle and tilt, and more columns where the robot has limits for further events. Also
     False where a trajectory is unknown, so read it together with `simulate(...).known`.
     """
-    return failures(simulate(heights, robot, actions, grid=grid), robot)
+    return failures(margins_of(heights, Setup.chosen(robot, actions, grid, contact, turn)), robot)
 
 
 @usual_flags()

@@ -22,7 +22,7 @@ from travjax.simulation.arcs import (
     above_centre,
     arc_maxima,
     by_trajectory,
-    margins_of,
+    margins_from,
     node_lanes,
     on_map,
     pose_maxima,
@@ -30,10 +30,10 @@ from travjax.simulation.arcs import (
     where_of,
 )
 from travjax.simulation.events import Margins, Nodes, Pose, Where, larger
-from travjax.simulation.footprint import Layout, View, node_table
-from travjax.simulation.grid import Grid
+from travjax.simulation.footprint import Layout, View
 from travjax.simulation.robot import Robot
-from travjax.simulation.steps import step_heights
+from travjax.simulation.setup import Setup
+from travjax.simulation.steps import step_heights, without_gaps
 from travjax.simulation.tyre_tables import Places, TyreTable, tyre_table
 
 ROUNDS = 2
@@ -101,27 +101,24 @@ def _scan_order(array: np.ndarray) -> np.ndarray:
     return array.reshape(chunks, poses, steps, each).transpose(0, 2, 1, 3)
 
 
-def tyre_margins(
-    maps: jax.Array, robot: Robot, actions: ActionSpace, grid: Grid, turn: bool = True, where: bool = False
-) -> tuple[Margins, Where | None]:
-    """Simulates every trajectory on a batch of maps [n, rows, cols]; see traverse.simulate."""
-    layout = node_table(robot, actions, grid).layout
-    chunks, source = _arc_chunks(robot, actions, grid, len(maps))
-    turns = _turns(robot, actions, grid) if turn else None
-    return _simulate(maps, chunks, source, turns, robot, layout, where)
+def tyre_margins(maps: jax.Array, setup: Setup, where: bool) -> tuple[Margins, Where | None]:
+    """Simulates every trajectory on a batch of maps [n, rows, cols]; `where` also finds where margins are reached."""
+    chunks, source = _arc_chunks(setup, len(maps))
+    turns = _turns(setup) if setup.contact.turn else None
+    return _simulate(maps, chunks, source, turns, setup.robot, setup.node_table().layout, where)
 
 
 @lru_cache(maxsize=8)
-def _arc_chunks(robot: Robot, actions: ActionSpace, grid: Grid, maps: int) -> tuple[TyreChunks, jax.Array]:
+def _arc_chunks(setup: Setup, maps: int) -> tuple[TyreChunks, jax.Array]:
     """Puts the tables of all arcs for batches of `maps` maps, and the `source` of trajectories, on the device."""
-    table = node_table(robot, actions, grid)
+    table = setup.node_table()
     arcs = table.poses.shape[0]
     if jax.default_backend() == "cpu":
         arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
     padding = table.poses[:1].repeat(-len(table.poses) % arcs, axis=0)
     poses = np.concatenate([table.poses, padding])
     with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
-        chunks = tyre_chunks(tyre_table(poses.reshape(-1, 3), robot, grid), len(poses) // arcs)
+        chunks = tyre_chunks(tyre_table(poses.reshape(-1, 3), setup.robot, setup.grid), len(poses) // arcs)
         return chunks, jnp.asarray(table.source)
 
 
@@ -141,13 +138,13 @@ class _Turns:
 
 
 @lru_cache(maxsize=8)
-def _turns(robot: Robot, actions: ActionSpace, grid: Grid) -> _Turns:
+def _turns(setup: Setup) -> _Turns:
     """Puts the tables of the point turns on the device."""
-    headings, passed, left = turn_poses(actions)
+    headings, passed, left = turn_poses(setup.actions)
     poses = np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=-1)
     with jax.ensure_compile_time_eval():
-        chunk = jax.tree.map(lambda array: array[0], tyre_chunks(tyre_table(poses, robot, grid), 1))
-        turn = actions.split(np.arange(len(actions)))[0]
+        chunk = jax.tree.map(lambda array: array[0], tyre_chunks(tyre_table(poses, setup.robot, setup.grid), 1))
+        turn = setup.actions.split(np.arange(len(setup.actions)))[0]
         return _Turns(chunk, *map(jnp.asarray, (passed, left, turn)))
 
 
@@ -172,21 +169,23 @@ def _simulate(
 ) -> tuple[Margins, Where | None]:
     grid, events = layout.grid, robot.events
     heights = above_centre(maps, grid)
-    steps = step_heights(heights, robot.wheel_diameter / 2, grid.spacing)
-    by_node, by_node_steps = node_lanes(heights), node_lanes(steps)
-    views, view_steps = view_lanes(by_node, layout), view_lanes(by_node_steps, layout)
+    filled = without_gaps(heights, robot.wheel_diameter / 2, grid.spacing)
+    steps = step_heights(filled, robot.wheel_diameter / 2, grid.spacing)
+    filled = jnp.where(jnp.isnan(filled), UNKNOWN_HEIGHT, filled)
+    ground = Ground(*map(node_lanes, (heights, filled, steps)))
+    views = Ground(*(view_lanes(field, layout) for field in (ground.heights, ground.filled, ground.steps)))
 
     def simulate_chunk(chunk: TyreChunks) -> tuple[jax.Array, jax.Array | None]:
-        return arc_maxima(settle(views, view_steps, chunk, robot, layout, where), layout, events)
+        return arc_maxima(settle(views, chunk, robot, layout, where), layout, events)
 
     maxima, places = jax.lax.map(simulate_chunk, chunks)
     maxima = by_trajectory(maxima, source, len(maps))
     if places is not None:
         places = jnp.stack([by_trajectory(places[:, part], source, len(maps)) for part in (0, 1)])
     if turns is not None:
-        turning = settle(by_node, by_node_steps, turns.chunk, robot, Layout(grid, (View(),), 0, 0, 0), where)
+        turning = settle(ground, turns.chunk, robot, Layout(grid, (View(),), 0, 0, 0), where)
         maxima, places = _with_turns(maxima, places, turning, turns, events)
-    margins = margins_of(maxima, events)
+    margins = margins_from(maxima, events)
     return margins, None if places is None else where_of(places, margins.known, grid.nodes)
 
 
@@ -206,9 +205,20 @@ def _with_turns(maxima, places, poses: Poses, turns: _Turns, events) -> tuple[ja
     return larger(turning, maxima), places
 
 
+@dataclass(frozen=True)
+class Ground:
+    """What the robot drives on, [nodes, lanes] metres each, above the map's centre and UNKNOWN_HEIGHT where unknown.
+
+    filled: heights of steps.without_gaps; steps: of steps.step_heights
+    """
+
+    heights: Float[Array, "nodes lanes"]
+    filled: Float[Array, "nodes lanes"]
+    steps: Float[Array, "nodes lanes"]
+
+
 def settle(
-    heights: Float[Array, "nodes lanes"],
-    steps: Float[Array, "nodes lanes"],
+    ground: Ground,
     chunk: TyreChunks,
     robot: Robot,
     layout: Layout,
@@ -216,8 +226,7 @@ def settle(
 ) -> Poses:
     """Puts the robot on the ground at the poses of one chunk; contacts are the wheels' resting heights.
 
-    heights: metres above the map's centre, UNKNOWN_HEIGHT where unknown; steps: metres, of steps.step_heights
-    where:   whether to find the nodes too
+    where: whether to find the nodes too
     """
     grid = layout.grid
     cols, spacing, wheelbase, track = grid.nodes, grid.spacing, robot.wheelbase, robot.track
@@ -240,12 +249,12 @@ def settle(
         """Returns how much higher the plane is at the robot's centre than at the node nearest to it."""
         return rounded(east * chunk.offset[:, :1]) + rounded(north * chunk.offset[:, 1:])
 
-    start, highest = _under_wheels(heights, chunk, cols)
+    start, highest = _under_wheels(ground.filled, chunk, cols)
     pitch, roll = (jnp.where(highest < UNKNOWN_HEIGHT / 2, slope, 0) for slope in slopes(start))
     for round_ in range(ROUNDS):
         east, north = a_cell(pitch, roll)
         last = round_ == ROUNDS - 1
-        above, step, wheel = _on_tyres(heights, steps if last else None, east, north, chunk, cols, where and last)
+        above, step, wheel = _on_tyres(ground.heights, ground.steps if last else None, east, north, chunk, cols, where and last)
         highest = larger(highest, above.max(axis=1))
         # A plane with the slopes so far lies at `above` under each wheel: their differences are what the slopes lack.
         plane = at_centre(east, north)[:, None] + rounded(pitch[:, None] * forward * (wheelbase / 2))
@@ -258,7 +267,7 @@ def settle(
     middle = (rest[:, 0] + rest[:, 1] + rest[:, 2] + rest[:, 3]) / 4
     east, north = a_cell(pitch, roll)
     level = jax.lax.optimization_barrier(middle - at_centre(east, north))
-    clearance, body = _clearance(heights, level, east, north, chunk, cols, where)
+    clearance, body = _clearance(ground.heights, level, east, north, chunk, cols, where)
     nodes = None
     if where:
         centre = jnp.broadcast_to(chunk.centre[:, None], body.shape)

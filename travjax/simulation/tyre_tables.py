@@ -68,9 +68,9 @@ def tyre_table(poses: np.ndarray, robot: Robot, grid: Grid) -> TyreTable:
     wheels = cells[:, None] + _turned(right, forward, cos[:, None], sin[:, None]) / grid.spacing
     corner = np.clip(np.floor(wheels).astype(int), 0, grid.cells - 1)
     blocks = [slice(start, start + POSES_AT_ONCE) for start in range(0, len(x), POSES_AT_ONCE)]
-    tyre, outline = _tyre_surface(robot, grid), _outline_surface(robot)
+    tyre, outline = _tyre_surface(robot, grid), _outline_surface(robot, grid)
     tyre_reach = math.hypot(robot.wheel_width + grid.spacing, robot.wheel_diameter + grid.spacing) / 2
-    reach = math.hypot(robot.overall_width, robot.overall_length) / 2
+    reach = math.hypot(robot.overall_width + grid.spacing, robot.overall_length + grid.spacing) / 2
 
     def of_tyres(block: slice) -> Places:
         count = len(cos[block])
@@ -104,20 +104,21 @@ def _tyre_surface(robot: Robot, grid: Grid) -> Surface:
     return drop
 
 
-def _outline_surface(robot: Robot) -> Surface:
-    radius, half_width = robot.wheel_diameter / 2, robot.wheel_width / 2
+def _outline_surface(robot: Robot, grid: Grid) -> Surface:
+    radius, half_width, half_cell = robot.wheel_diameter / 2, robot.wheel_width / 2, grid.spacing / 2
     overhang = 0.0 if robot.overhang_height is None else robot.overhang_height - robot.ride_height
 
     def underside(right: np.ndarray, forward: np.ndarray) -> np.ndarray:
         aside, along = np.abs(right), np.abs(forward)
-        outline = (aside <= robot.overall_width / 2 + TIE) & (along <= robot.overall_length / 2 + TIE)
+        outline = aside <= robot.overall_width / 2 + half_cell + TIE
+        outline &= along <= robot.overall_length / 2 + half_cell + TIE
         chassis = (aside <= robot.chassis_width / 2 + TIE) & (along <= robot.chassis_length / 2 + TIE)
         tyre = (np.abs(aside - robot.track / 2) <= half_width + TIE) & (
             np.abs(along - robot.wheelbase / 2) <= radius + TIE
         )
         end = max(robot.overall_length - robot.wheelbase, TIE) / 2
         rise = (robot.nose_rise or 0.0) * np.clip((along - robot.wheelbase / 2) / end, 0, 1)
-        return np.where((outline | chassis) & ~tyre, np.where(chassis, 0.0, overhang) + rise, np.nan)
+        return np.where(outline & ~tyre, np.where(chassis, 0.0, overhang) + rise, np.nan)
 
     return underside
 

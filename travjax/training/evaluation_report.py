@@ -180,8 +180,6 @@ def _predictions(evaluator: Evaluator, estimator: Network, maps: int, samples: i
         failed,
         known,
         titles,
-        trained.robot,
-        trained.actions,
-        trained.grid,
+        trained.setup,
         every=every,
     )

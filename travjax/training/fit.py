@@ -20,7 +20,7 @@ from travjax.models.input_images import render_inputs
 from travjax.resnet.imagenet_weights import load_weights
 from travjax.runs.run import DATA, Run, has_checkpoints
 from travjax.runs.run_log import read_rows
-from travjax.simulation.setup import load_setup
+from travjax.simulation.setup import Setup
 from travjax.training.trainer import Trainer
 
 
@@ -37,7 +37,7 @@ def run_from_preset(
     """Returns the run of a preset, with any settings that are to differ from it.
 
     preset:  a preset, or its TOML file
-    robot, actions, size, spacing: as `load_setup` takes them; the preset's robot unless given
+    robot, actions, size, spacing: as `Setup.load` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
     seed:    seed of the data set and of training
     Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
@@ -51,8 +51,7 @@ def run_from_preset(
             preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
         )
     preset = replace(preset, robot=robot or preset.robot)
-    grid, loaded, space = load_setup(preset.robot, actions, size, spacing)
-    return Run(preset, loaded, space, grid)
+    return Run(preset, Setup.load(preset.robot, actions, size, spacing))
 
 
 @usual_flags()
@@ -120,7 +119,7 @@ def _dataset(data: str | Path | None, wanted: Run, folder: Path, devices: Device
     for split, size in zip(dataset.SPLITS[:2], config.split_sizes()[:2], strict=True):
         require(size > 0, f"the preset's [dataset]: {split} maps", size, "at least 1: more maps, other shares")
     if devices.main and not (kept / "dataset.json").exists():
-        build_synthetic(config, wanted.robot, wanted.actions, wanted.grid, kept)
+        build_synthetic(config, wanted.setup, kept)
     devices.wait()
     loaded = dataset.load(kept)
     made_anew = "remove it to have it made anew, or take another --out"

@@ -27,10 +27,9 @@ from travjax.models.input_images import ImageSource
 from travjax.models.trajectory_resnet import create
 from travjax.models.variables import VARIABLES, split_model
 from travjax.resnet.network import ResNetConfig
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
 from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
 
@@ -57,13 +56,11 @@ class Bench:
     given.
     """
 
-    def __init__(
-        self, robot: Robot, actions: ActionSpace, grid: Grid, repeats: int, trunk: ResNetConfig = ResNetConfig()
-    ):
+    def __init__(self, setup: Setup, repeats: int, trunk: ResNetConfig = ResNetConfig()):
         self.repeats, self.devices = repeats, Devices.all()
-        self.dataset = generate(DatasetConfig(MAPS), robot, actions, grid)
-        self.source = self.devices.replicate(ImageSource.from_maps(self.dataset.heights, robot, actions, grid, 1.0))
-        self.graph, self.variables = split_model(create(trunk, events=robot.event_names))
+        self.dataset = generate(DatasetConfig(MAPS), setup)
+        self.source = self.devices.replicate(ImageSource.from_maps(self.dataset.heights, setup, 1.0))
+        self.graph, self.variables = split_model(create(trunk, events=setup.robot.event_names))
         self.sampler = Sampler(self.dataset.labels, np.arange(MAPS), fresh=True)
 
     def rows(self) -> Iterator[dict]:
@@ -143,14 +140,14 @@ class Bench:
         }
 
 
-def measure(robot: Robot, actions: ActionSpace, grid: Grid, out: str | Path, repeats: int = 15) -> None:
+def measure(setup: Setup, out: str | Path, repeats: int = 15) -> None:
     """Measures inputs, a training step and all trajectories of a map; prints the table and writes it as TSV.
 
     repeats: number of timed calls; the median is reported
     Raises InputError when nothing can be written to `out`.
     """
     folder = output_folder(out)
-    rows = list(progress.bar("network", 4, "row", iterable=Bench(robot, actions, grid, repeats).rows()))
+    rows = list(progress.bar("network", 4, "row", iterable=Bench(setup, repeats).rows()))
     simulator_benchmark.write_rows(with_ratio(rows), COLUMNS, folder / "network.tsv")
 
 

@@ -20,7 +20,7 @@ import optax
 
 from travjax import progress
 from travjax.config import InputError, one_line, require
-from travjax.data.dataset import Dataset, require_matching
+from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.estimators.inference import NoNumbers, Placed, probabilities
@@ -79,7 +79,7 @@ class Trainer:
         eval_sets: Mapping[str, Samples] | None = None,
         features: Mapping[str, np.ndarray] | None = None,
     ):
-        require_matching(dataset, run.robot, run.actions, run.grid)
+        dataset.setup.require_same(run.setup, "data set")
         devices.check_batch(run.preset.training.batch_size)
         self.run, self.folder, self.devices = run, folder, devices
         self.kind, self.config = run.kind, run.preset.training
