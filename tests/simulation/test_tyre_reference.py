@@ -147,10 +147,10 @@ def test_a_node_under_a_tyre_counts_only_where_the_tyre_reaches_it():
 @pytest.mark.parametrize("spacing", SPACINGS)
 @pytest.mark.parametrize("shift", np.arange(0.37, 0.431, 0.01))
 def test_a_wall_in_the_band_of_a_tyre_is_never_safe(spacing, shift):
-    """The wall begins at the first node from `shift` on, or is one node thick."""
+    """The wall begins at the first node from `shift` on whose cell the tyre overlaps, or is one node thick."""
     x, _ = nodes(spacing)
     first = np.ceil(shift / spacing - 1e-9) * spacing
-    if first > 0.417:  # beyond the tyre, were there no half cells
+    if first - spacing / 2.0 > (ROBOT.track + ROBOT.wheel_width) / 2.0:
         first -= spacing
     for wall in (x > first - 1e-6, np.abs(x - first) < 1e-6):
         margins = simulated(1.5 * wall, spacing=spacing)
