@@ -147,10 +147,10 @@ def test_a_node_under_a_tyre_counts_only_where_the_tyre_reaches_it():
 @pytest.mark.parametrize("spacing", SPACINGS)
 @pytest.mark.parametrize("shift", np.arange(0.37, 0.431, 0.01))
 def test_a_wall_in_the_band_of_a_tyre_is_never_safe(spacing, shift):
-    """The wall begins at the first node from `shift` on, or is one node thick."""
+    """The wall begins at the first node from `shift` on whose cell the tyre overlaps, or is one node thick."""
     x, _ = nodes(spacing)
     first = np.ceil(shift / spacing - 1e-9) * spacing
-    if first > 0.417:  # beyond the tyre, were there no half cells
+    if first - spacing / 2.0 > (ROBOT.track + ROBOT.wheel_width) / 2.0:
         first -= spacing
     for wall in (x > first - 1e-6, np.abs(x - first) < 1e-6):
         margins = simulated(1.5 * wall, spacing=spacing)
@@ -219,6 +219,16 @@ def test_a_trench_of_one_node_is_no_step(along):
     assert not any(failures(margins))
 
 
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_a_rise_within_the_radius_is_one_step(spacing):
+    """It takes two cells, each of which alone is as steep as the other; a long bank is a slope."""
+    _, y = nodes(spacing)
+    rise = 0.3 * np.clip(y / (2.0 * spacing), 0.0, 1.0)
+    assert tyre.step_heights(rise, RADIUS, spacing).max() == pytest.approx(0.3)
+    bank = 0.7 * np.clip(y, 0.0, 1.0)
+    assert inner(tyre.step_heights(bank, RADIUS, spacing), spacing).max() < 1e-9
+
+
 def test_a_trench_wider_than_the_radius_is_a_step():
     for count, step in ((2, 0.0), (3, 0.3)):
         heights = np.zeros((65, 65))
@@ -275,13 +285,24 @@ def test_the_overhang_and_the_nose_have_their_own_clearance():
 
 
 def test_ground_within_the_rectangle_of_a_tyre_is_no_obstacle():
+    """A stone 0.1625 m before a wheel's centre, where the tyre's surface is 0.05 m high."""
     heights = np.zeros((33, 33))
-    heights[16 + 3, 16 + 5] = 0.1
+    heights[16 + 6, 16 + 5] = 0.12
     state = tyre.pose_state(heights, ROBOT, 0.0, 0.0, 0.0)
-    assert state.clearance_node != (19, 21)
-    assert state.step == pytest.approx(0.1)
-    assert state.step_node == (19, 21)
-    np.testing.assert_allclose(state.resting, [0.01, 0.1, 0.01, 0.01], atol=0.005)
+    assert state.step == pytest.approx(0.12)
+    assert state.step_node == (22, 21)
+    np.testing.assert_allclose(state.resting, [0.01, 0.06, 0.01, 0.01], atol=0.005)
+    narrow = tyre.pose_state(heights, Carrier(wheel_width=0.03), 0.0, 0.0, 0.0)
+    assert narrow.clearance_node == (22, 21)  # beside the tyre's rectangle and within the outline
+    assert state.clearance_node != (22, 21)
+    assert state.clearance < narrow.clearance
+
+
+def test_a_tyre_touches_half_a_cell_before_its_front():
+    for forward, touched in ((7, True), (8, False)):  # 0.225 and 0.2875 m before a wheel's centre
+        heights = np.zeros((33, 33))
+        heights[16 + forward, 16 + 5] = 1.5
+        assert (tyre.pose_state(heights, ROBOT, 0.0, 0.0, 0.0).step == 1.5) is touched
 
 
 @pytest.mark.parametrize("trajectory", range(4))
