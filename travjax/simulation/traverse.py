@@ -39,7 +39,7 @@ def simulate(
              float32, so a site at 2000 m loses nothing
     robot:   a Robot, or the name or file of one; the Seekur Jr unless given
     actions: the paper's action space unless given
-    contact: "nearest", the paper's contact model (SPEC section 5), or "tyre" (section 15); that of the robot's file unless
+    contact: "nearest", the paper's contact model (SPEC section 5), or "tyre" (15); that of the robot's file unless
              given, and "nearest" where it has none
     turn:    whether `tyre` simulates the point turn at the start of a trajectory; `nearest` never does
     where:   whether to return (Margins, Where): also the pose and the node at which each margin is reached

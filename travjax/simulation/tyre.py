@@ -254,7 +254,9 @@ def settle(
     for round_ in range(ROUNDS):
         east, north = a_cell(pitch, roll)
         last = round_ == ROUNDS - 1
-        above, step, wheel = _on_tyres(ground.heights, ground.steps if last else None, east, north, chunk, cols, where and last)
+        above, step, wheel = _on_tyres(
+            ground.heights, ground.steps if last else None, east, north, chunk, cols, where and last
+        )
         highest = larger(highest, above.max(axis=1))
         # A plane with the slopes so far lies at `above` under each wheel: their differences are what the slopes lack.
         plane = at_centre(east, north)[:, None] + rounded(pitch[:, None] * forward * (wheelbase / 2))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from travjax.config import InputError
+from travjax.config import InputError, require
 from travjax.simulation.footprint import TIE
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
@@ -60,6 +60,7 @@ def tyre_table(poses: np.ndarray, robot: Robot, grid: Grid) -> TyreTable:
 
     Raises InputError when tyres or outline leave the map, or when no node lies under the outline.
     """
+    require_inside(robot, poses, grid)
     x, y, heading = np.asarray(poses, float).T
     cos, sin = np.cos(heading), np.sin(heading)
     cells = np.stack([x, y], axis=-1) / grid.spacing + grid.cells / 2  # of the robot's centre: column, row
@@ -87,6 +88,29 @@ def tyre_table(poses: np.ndarray, robot: Robot, grid: Grid) -> TyreTable:
         tyres=_joined([of_tyres(block) for block in blocks]),
         outline=_joined([_places(cells[b], centre[b], cos[b], sin[b], outline, reach, grid) for b in blocks]),
     )
+
+
+def require_inside(robot: Robot, poses: np.ndarray, grid: Grid) -> None:
+    """Raises InputError when the overall outline, or a tyre, leaves the map at one of the poses [N, 3], or when the
+    outline does not contain the chassis.
+    """
+    for name in ("length", "width"):
+        overall, chassis = getattr(robot, f"overall_{name}"), getattr(robot, f"chassis_{name}")
+        allowed = f'at least chassis_{name} = {chassis:g} m for the contact model "tyre"'
+        require(overall >= chassis - TIE, f"overall_{name}", overall, allowed)
+    half_width = max(robot.overall_width, robot.track + robot.wheel_width) / 2
+    half_length = max(robot.overall_length, robot.wheelbase + robot.wheel_diameter) / 2
+    x, y, heading = np.asarray(poses, float).T
+    cos, sin = np.abs(np.cos(heading)), np.abs(np.sin(heading))
+    farthest = max(
+        np.max(np.abs(x) + half_width * cos + half_length * sin),
+        np.max(np.abs(y) + half_width * sin + half_length * cos),
+    )
+    if farthest > grid.size / 2 + TIE:
+        raise InputError(
+            f"size = {grid.size:g}: the robot's outline leaves the map by {farthest - grid.size / 2:g} m; allowed: "
+            'arcs short enough to stay on it, a larger map (--size), or the contact model "nearest"'
+        )
 
 
 Surface = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -137,17 +161,12 @@ def _places(cells: np.ndarray, centre: np.ndarray, cos, sin, surface: Surface, r
     east, north = (col - cells[:, :1]) * grid.spacing, (row - cells[:, 1:]) * grid.spacing
     cos, sin = cos[:, None], sin[:, None]
     height = surface(east * cos + north * sin, north * cos - east * sin)
-    pose, place = np.nonzero(np.isfinite(height))
+    on_map = (row >= 0) & (row <= grid.cells) & (col >= 0) & (col <= grid.cells)
+    pose, place = np.nonzero(np.isfinite(height) & on_map)
     counts = np.bincount(pose, minlength=len(cells))
     if not counts.all():
         raise InputError(f"spacing = {grid.spacing:g}: too coarse for the robot, no node under its outline")
     col, row, height = col[pose, place], row[pose, place], height[pose, place]
-    outside = max(-col.min(), -row.min(), col.max() - grid.cells, row.max() - grid.cells)
-    if outside > 0:
-        raise InputError(
-            f"size = {grid.size:g}: the robot's outline leaves the map by {outside * grid.spacing:g} m; "
-            "allowed: arcs short enough to stay on it, or a larger map (--size)"
-        )
     slot = np.minimum(np.arange(counts.max()), counts[:, None] - 1) + (np.cumsum(counts) - counts)[:, None]
     return Places(
         row=(row[slot] - centre[:, 1:]).astype(np.int16),
