@@ -15,9 +15,9 @@ from tests import field_runs, small_training
 from travjax.jax_flags import key_of, usual_flags
 from travjax.models.input_images import render_inputs
 from travjax.runs.predictor import Predictor
-from travjax.simulation.traverse import label, simulate
 from travjax.terrain.noise import noise2
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal.traverse import label, simulate
 
 FLAGS = {
     "jax_enable_x64": True,

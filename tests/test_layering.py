@@ -10,7 +10,8 @@ import travjax
 
 LAYERS = {
     "": "config signals locks memory files npz_stream progress jax_flags batching devices",
-    "simulation": "arrays grid heights events robot actions footprint setup traverse reference",
+    "simulation": "arrays grid heights events contact robot actions footprint tyre_tables setup",
+    "traversal": "arcs nearest steps tyre traverse reference tyre_reference pose_by_pose",
     "terrain": "noise landforms rock_field styles",
     "rasters": "coordinates reading_options formats raster gdal_files array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
@@ -98,11 +99,11 @@ def test_a_package_can_be_taken_in_at_a_glance(package):
 
 
 def test_the_sequential_simulator_shares_no_code_with_the_package():
-    assert imports_of((PACKAGE / "simulation/reference.py").read_text()) == set()
+    assert imports_of((PACKAGE / "traversal/reference.py").read_text()) == set()
 
 
 def test_modules_are_found_at_all():
-    assert {"config", "simulation.reference", "simulation.traverse", "__init__"} <= set(MODULES)
+    assert {"config", "traversal.reference", "traversal.traverse", "__init__"} <= set(MODULES)
 
 
 # ---- Commands parse, call and print; the library and the experiments do without them

@@ -7,13 +7,14 @@ from .models.input_images import render_inputs
 from .runs.predictor import Predictor, predict
 from .runs.run import load_estimator
 from .simulation.actions import ActionSpace
-from .simulation.events import EVENTS, Margins
+from .simulation.events import EVENTS, Margins, Where
 from .simulation.grid import Grid
 from .simulation.robot import Robot
-from .simulation.traverse import failures, label, simulate
 from .terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 from .training.evaluation_report import evaluate_run
 from .training.fit import fit, run_from_preset
+from .traversal.pose_by_pose import Traverse, traverse
+from .traversal.traverse import failures, label, simulate
 
 __version__: str
 
@@ -27,6 +28,8 @@ __all__ = [
     "Predictor",
     "Robot",
     "TerrainParams",
+    "Traverse",
+    "Where",
     "elevation",
     "evaluate_run",
     "failures",
@@ -41,4 +44,5 @@ __all__ = [
     "run_from_preset",
     "sample_params",
     "simulate",
+    "traverse",
 ]

@@ -17,7 +17,7 @@ from travjax.models.input_images import render_inputs
 from travjax.models.variables import split_model
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
-from travjax.simulation.traverse import unpacked
+from travjax.traversal.traverse import unpacked
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 

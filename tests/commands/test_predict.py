@@ -16,8 +16,8 @@ from travjax.evaluation import metrics, tables
 from travjax.runs.model_file import write_model
 from travjax.runs.predictor import Predictor
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal.traverse import failures, simulate
 
 SEED = 40
 COUNT = 10

@@ -23,8 +23,8 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import label, simulate, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal.traverse import label, simulate, unpacked
 
 SETUP = SETUPS["coarse small map"]
 ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid

@@ -14,8 +14,8 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import simulate
 from travjax.terrain.styles import generate_terrain
+from travjax.traversal.traverse import simulate
 
 GRID, HUSKY = Grid(4, 0.125), Robot.load("husky_a200")
 ACTIONS = ActionSpace(turns=2, arc_lengths=(0.6, 0.5), radii=(float("inf"),), interval=0.1)

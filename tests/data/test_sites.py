@@ -15,8 +15,8 @@ from travjax.data.dem import load_dem
 from travjax.data.provenance import SPLITS, Site, SitesConfig
 from travjax.data.sites import read, turned
 from travjax.files import sha256
-from travjax.simulation.reference import simulate_trajectory
-from travjax.simulation.traverse import unpacked
+from travjax.traversal.reference import simulate_trajectory
+from travjax.traversal.traverse import unpacked
 
 SETUP = SETUPS["coarse small map"]
 ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid

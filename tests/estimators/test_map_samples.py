@@ -16,7 +16,7 @@ from travjax.models.pose_stencil import stencil
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import View, views_of
 from travjax.simulation.grid import Grid
-from travjax.simulation.traverse import failures, simulate, unpacked
+from travjax.traversal.traverse import failures, simulate, unpacked
 
 CLEAN = replace(PRESET, corruption=CorruptionConfig(0.0))
 STEPS = range(12)

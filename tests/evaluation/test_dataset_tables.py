@@ -17,8 +17,8 @@ from travjax.evaluation.dataset_tables import (
     statistics_table,
     windows_table,
 )
-from travjax.simulation.traverse import unpacked
 from travjax.terrain.styles import STYLES
+from travjax.traversal.traverse import unpacked
 
 SETUP = SETUPS["coarse small map"]
 ROBOT, ACTIONS, GRID = SETUP.robot, SETUP.actions, SETUP.grid

@@ -10,8 +10,8 @@ from travjax.evaluation.map_reports import label_maps, write_terrain
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.styles import generate_terrain
+from travjax.traversal.traverse import failures, simulate
 
 HUSKY, GRID = Robot.load("husky_a200"), Grid(4, 0.125)
 SETUP = Setup(HUSKY, FEW, GRID)

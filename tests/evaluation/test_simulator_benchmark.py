@@ -22,8 +22,8 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import label, unpacked
 from travjax.terrain.styles import generate_terrain
+from travjax.traversal.traverse import label, unpacked
 
 SEEKUR_JR = Robot.load("seekur_jr")
 FRAIL = replace(SEEKUR_JR, max_step=0.02, ride_height=0.04, max_tilt=0.1)

@@ -19,7 +19,7 @@ from travjax.experiments.robustness import (
     of_sites,
 )
 from travjax.runs.predictor import Predictor
-from travjax.simulation.traverse import simulate
+from travjax.traversal.traverse import simulate
 
 
 @pytest.fixture(scope="module")

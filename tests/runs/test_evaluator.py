@@ -20,7 +20,7 @@ from travjax.runs.evaluator import Evaluator
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import unpacked
+from travjax.traversal.traverse import unpacked
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from travjax.config import InputError
-from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace, arc_poses
+from travjax.traversal import reference
 
 LENGTH = 1.65
 TIGHTEST = 2 * LENGTH / math.pi

@@ -21,10 +21,11 @@ from travjax.evaluation.metrics import evaluate
 from travjax.evaluation.tables import metrics_table, shares_table
 from travjax.runs.predictor import Predictor
 from travjax.runs.run_log import read_rows
-from travjax.simulation import events, reference, robot
+from travjax.simulation import events, robot
 from travjax.simulation.events import EVENTS, OPTIONAL, PAPER, Event, Pose, label_bit, label_codes
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import failures, packed, simulate, unpacked
+from travjax.traversal import reference
+from travjax.traversal.traverse import failures, packed, simulate, unpacked
 
 ROLLING = replace(HUSKY, max_roll=math.radians(6))
 SETUP = Setup(ROLLING, FEW, GRID)

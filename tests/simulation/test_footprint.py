@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from travjax.config import InputError
-from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import RUN, TIE, View, chassis_places, node_table
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
+from travjax.traversal import reference
 
 SEEKUR_JR = Robot.load("seekur_jr")
 STRAIGHT = ActionSpace(turns=1, radii=(math.inf,))

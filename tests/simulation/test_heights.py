@@ -11,8 +11,8 @@ from travjax.runs.predictor import predict
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import MARKERS, Grid
 from travjax.simulation.heights import as_maps
-from travjax.simulation.traverse import label, simulate
 from travjax.terrain.styles import elevation, generate_terrain, sample_params
+from travjax.traversal.traverse import label, simulate
 
 GRID = Grid(4, 0.125)
 ACTIONS = ActionSpace(turns=2, arc_lengths=(0.6, 0.5), radii=(float("inf"),), interval=0.1)

@@ -8,7 +8,6 @@ import pytest
 from travjax.config import InputError
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
-from travjax.simulation.traverse import failures, simulate
 from travjax.terrain.rock_field import (
     RANGES,
     SITES,
@@ -18,6 +17,7 @@ from travjax.terrain.rock_field import (
     site_heights,
 )
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal.traverse import failures, simulate
 
 PLAIN = RockFieldParams(rock_abundance=0.0)
 

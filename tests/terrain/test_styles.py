@@ -13,8 +13,8 @@ from opensimplex import OpenSimplex
 
 from travjax.config import InputError
 from travjax.simulation.grid import Grid
-from travjax.simulation.traverse import simulate
 from travjax.terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
+from travjax.traversal.traverse import simulate
 
 FIELDS = [field.name for field in fields(TerrainParams)]
 

@@ -46,9 +46,9 @@ from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.events import EVENTS
-from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
 from travjax.training.trainer import Trainer
+from travjax.traversal.traverse import unpacked
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 

@@ -36,8 +36,8 @@ from travjax.simulation.events import label_codes
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import PARTS, Setup
-from travjax.simulation.traverse import failures, margins_of, packed, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain, require_world
+from travjax.traversal.traverse import failures, margins_of, packed, unpacked
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
 """Each array has its own file, `heights.npy` and so on; data sets of real maps also have PROVENANCE_ARRAYS."""

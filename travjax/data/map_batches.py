@@ -20,9 +20,9 @@ from travjax.data.dem import Windows, load_dem
 from travjax.rasters.reading_options import DemOptions
 from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import failures, margins_of
 from travjax.terrain.rock_field import rock_fields, sample_rock_field
 from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params, world_note
+from travjax.traversal.traverse import failures, margins_of
 
 Batch = dict[str, np.ndarray]
 

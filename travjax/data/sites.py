@@ -31,7 +31,7 @@ from travjax.rasters.coordinates import is_local, places
 from travjax.simulation.events import UNKNOWN_LABEL
 from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import failures, margins_of, packed
+from travjax.traversal.traverse import failures, margins_of, packed
 
 
 class Assignment(IntEnum):

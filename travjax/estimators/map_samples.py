@@ -27,7 +27,7 @@ from travjax.jax_flags import usual_flags
 from travjax.models.pose_stencil import Stencil, stencil
 from travjax.simulation.footprint import views_of
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import margins_of
+from travjax.traversal.traverse import margins_of
 
 
 @partial(jax.tree_util.register_dataclass, data_fields=["heights", "stencil", "elevation_scale"], meta_fields=[])

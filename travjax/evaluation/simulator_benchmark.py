@@ -23,10 +23,10 @@ from travjax.config import InputError
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, output_folder
-from travjax.simulation import reference
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import failures, margins_of, packed
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal import reference
+from travjax.traversal.traverse import failures, margins_of, packed
 
 COLUMNS = {
     "what": "what",

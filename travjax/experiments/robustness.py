@@ -22,7 +22,7 @@ from travjax.runs.predictor import Predictor
 from travjax.simulation.events import EVENTS
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import margins_of
+from travjax.traversal.traverse import margins_of
 
 Maps = Float[np.ndarray, "n rows cols"]
 Fails = Float[np.ndarray, "*m k"]

@@ -35,9 +35,9 @@ from travjax.files import find_preset, held, put_back, save_text, user_path
 from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import DATA, Run
 from travjax.signals import going_on
-from travjax.simulation.traverse import unpacked
 from travjax.training.evaluation_report import evaluate_run
 from travjax.training.fit import fit
+from travjax.traversal.traverse import unpacked
 
 DESCRIPTION = (
     "Trains on real maps from random weights, from ImageNet, and from ImageNet and synthetic maps, and scores every "

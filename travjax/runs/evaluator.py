@@ -17,7 +17,7 @@ from travjax.evaluation import metrics
 from travjax.evaluation.baselines import LogisticRegression, slope_and_step
 from travjax.models.variables import Network
 from travjax.runs.run import Run
-from travjax.simulation.traverse import margins_of, unpacked
+from travjax.traversal.traverse import margins_of, unpacked
 
 SPARSEST = 6
 """A figure shows at least every sixth trajectory."""

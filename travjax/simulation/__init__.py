@@ -1,5 +1,5 @@
-"""Traverse simulation: what happens to a robot on a map.
+"""What is simulated: heights, robots, action spaces, failure events, and the nodes that a robot touches at its poses.
 
-In: heights of maps, a robot, an action space. Out: step, obstacle and tilt margins and failures of every trajectory.
+In: arrays, TOML files. Out: checked maps, a Setup of robot, actions, grid and contact model, and tables of nodes.
 Stands on NumPy, JAX and the top-level modules of travjax.
 """

@@ -7,7 +7,7 @@ With an even number of point turns the action space is symmetric under a rotatio
 radii in +- pairs under mirroring. Tables then need only one arc of each set of symmetric arcs (an orbit), and the
 kernel simulates it on the map and on its rotated and mirrored images side by side (the "views" below).
 
-Dimensions of arrays, here and in traverse.py:
+Dimensions of arrays, here, in tyre_tables.py and in the package traversal:
 
     T   trajectories of the action space
     F   first arcs of a table, one of each orbit

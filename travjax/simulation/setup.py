@@ -35,7 +35,7 @@ def chosen_robot(robot: Robot | str | None) -> Robot:
 
 @dataclass(frozen=True)
 class Setup:
-    """Everything that labels depend on, apart from the heights: robot, action space, grid of the maps, contact model."""
+    """Everything that labels depend on, apart from the heights: robot, action space, grid and contact model."""
 
     robot: Robot
     actions: ActionSpace = ActionSpace()

@@ -19,7 +19,7 @@ from travjax.jax_flags import usual_flags
 from travjax.models.variables import Network
 from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import DATA, Run, load_estimator
-from travjax.simulation.traverse import unpacked
+from travjax.traversal.traverse import unpacked
 
 MARGINS = "regressed margins above their limits"
 

@@ -30,8 +30,8 @@ from travjax.resnet.network import ResNetConfig
 from travjax.simulation.events import EVENTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
-from travjax.simulation.traverse import unpacked
 from travjax.training.step import StepSettings, update
+from travjax.traversal.traverse import unpacked
 
 COLUMNS = {
     "what": "what",

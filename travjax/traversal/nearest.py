@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from travjax.batching import rounded
-from travjax.simulation.arcs import (
+from travjax.simulation.events import PAPER, Event, Margins, Nodes, Where, larger
+from travjax.simulation.footprint import RUN, Layout, chassis_places
+from travjax.simulation.setup import Setup
+from travjax.traversal.arcs import (
     UNKNOWN_HEIGHT,
     Poses,
     above_centre,
@@ -25,9 +28,6 @@ from travjax.simulation.arcs import (
     view_lanes,
     where_of,
 )
-from travjax.simulation.events import PAPER, Event, Margins, Nodes, Where, larger
-from travjax.simulation.footprint import RUN, Layout, chassis_places
-from travjax.simulation.setup import Setup
 
 FEW_MAPS = 2
 """For up to this many maps, RUN neighbouring nodes are read at once: the lanes alone do not fill a vector register."""

@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 
 from tests.conftest import SETUPS
 from travjax.config import InputError
-from travjax.simulation import reference
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import EVENTS, Margins
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
-from travjax.simulation.traverse import failures, label, packed, simulate, unpacked
 from travjax.terrain.styles import STYLES, generate_terrain
+from travjax.traversal import reference
+from travjax.traversal.traverse import failures, label, packed, simulate, unpacked
 
 SEEKUR_JR = Robot.load("seekur_jr")
 PAPER = ActionSpace()

@@ -15,10 +15,10 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import UNKNOWN_LABEL, Margins, Where, label_bit
 from travjax.simulation.grid import Grid
 from travjax.simulation.heights import Heights, as_maps
-from travjax.simulation.nearest import nearest_margins
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup, chosen_robot
-from travjax.simulation.tyre import tyre_margins
+from travjax.traversal.nearest import nearest_margins
+from travjax.traversal.tyre import tyre_margins
 
 
 @usual_flags()

@@ -97,17 +97,49 @@ def simulate_trajectory(heights, robot, actions, trajectory: int, cell_size: flo
     step, obstacle, tilt = 0.0, -math.inf, 0.0
     previous = None
     for x, y, heading in path.tolist():
-        contacts = _wheel_contacts(heights, robot, x, y, heading, cell_size)
-        plane = _pose_plane(contacts, robot)
-        clearance = _highest_above_plane(heights, robot, plane, x, y, heading, cell_size)
-        if math.isnan(sum(contacts)) or math.isnan(clearance):
+        state = pose_state(heights, robot, x, y, heading, cell_size)
+        if not state.known:
             return UNKNOWN_MARGINS
         if previous is not None:
-            step = max(step, *(abs(now - before) for now, before in zip(contacts, previous, strict=True)))
-        obstacle = max(obstacle, clearance)
-        tilt = max(tilt, math.atan(math.hypot(plane[1], plane[2])))
-        previous = contacts
+            step = max(step, *(abs(now - before) for now, before in zip(state.contacts, previous, strict=True)))
+        obstacle = max(obstacle, state.clearance)
+        tilt = max(tilt, state.tilt)
+        previous = state.contacts
     return TrajectoryMargins(step, obstacle, tilt, known=True)
+
+
+@dataclass(frozen=True)
+class PoseState:
+    """How the robot stands at one pose: lengths in metres; numbers are NaN unless known (section 5).
+
+    contacts: heights of the nodes under the wheels FL, FR, RL, RR; nodes: (row, col) of each
+    centre, roll_slope, pitch_slope: the pose plane: its height at the robot's centre, its slopes right and forward
+    clearance: the highest node under the chassis above the pose plane; clearance_node: (row, col) of it
+    """
+
+    contacts: list[float]
+    nodes: list[tuple[int, int]]
+    centre: float
+    roll_slope: float
+    pitch_slope: float
+    clearance: float
+    clearance_node: tuple[int, int]
+    known: bool
+
+    @property
+    def tilt(self) -> float:
+        """The angle between the pose plane and the horizontal in radians."""
+        return math.atan(math.hypot(self.roll_slope, self.pitch_slope))
+
+
+def pose_state(heights: np.ndarray, robot, x: float, y: float, heading: float, cell_size: float = 0.0625) -> PoseState:
+    """Computes how the robot stands at one pose (section 5); heights as of `above_centre`."""
+    nodes = _wheel_nodes(heights, robot, x, y, heading, cell_size)
+    contacts = [heights.item(*node) for node in nodes]
+    plane = _pose_plane(contacts, robot)
+    clearance, highest = _highest_above_plane(heights, robot, plane, x, y, heading, cell_size)
+    known = not (math.isnan(sum(contacts)) or math.isnan(clearance))
+    return PoseState(contacts, nodes, *plane, clearance, highest, known)
 
 
 def above_centre(heights) -> np.ndarray:
@@ -139,17 +171,17 @@ def _check_on_map(heights: np.ndarray, robot, path: np.ndarray, cell_size: float
         raise ValueError(f"the robot reaches {reach} m in x, y, allowed on this map are {half_size} m")
 
 
-def _wheel_contacts(heights, robot, x: float, y: float, heading: float, cell_size: float) -> list[float]:
-    """Returns the heights of the nodes nearest to the wheel centres, in the order FL, FR, RL, RR."""
+def _wheel_nodes(heights, robot, x: float, y: float, heading: float, cell_size: float) -> list[tuple[int, int]]:
+    """Returns (row, col) of the nodes nearest to the wheel centres, in the order FL, FR, RL, RR."""
     sin, cos = math.sin(heading), math.cos(heading)
     rows, cols = heights.shape
     right, forward = robot.track / 2.0, robot.wheelbase / 2.0
-    contacts = []
+    nodes = []
     for u, v in ((-right, forward), (right, forward), (-right, -forward), (right, -forward)):
         col = (x + u * cos - v * sin) / cell_size + cols // 2
         row = (y + u * sin + v * cos) / cell_size + rows // 2
-        contacts.append(heights.item(_nearest(row), _nearest(col)))
-    return contacts
+        nodes.append((_nearest(row), _nearest(col)))
+    return nodes
 
 
 def _nearest(coordinate: float) -> int:
@@ -165,8 +197,10 @@ def _pose_plane(contacts: list[float], robot) -> tuple[float, float, float]:
     return centre, roll_slope, pitch_slope
 
 
-def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: float, cell_size: float) -> float:
-    """Returns the largest height of a node under the chassis above the pose plane; NaN if one of them is unknown."""
+def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: float, cell_size: float):
+    """Returns the largest height of a node under the chassis above the pose plane, NaN if one of them is unknown, and
+    (row, col) of that node.
+    """
     sin, cos = math.sin(heading), math.cos(heading)
     radius = _circumradius(robot)
     rows = window(y, radius, heights.shape[0], cell_size)
@@ -179,7 +213,9 @@ def _highest_above_plane(heights, robot, plane, x: float, y: float, heading: flo
     within_length = np.abs(v) <= robot.chassis_length / 2.0 + CHASSIS_TIE
     centre, roll_slope, pitch_slope = plane
     above_plane = heights[rows, cols] - (centre + roll_slope * u + pitch_slope * v)
-    return float(above_plane[within_width & within_length].max(initial=-math.inf))
+    under = np.where(within_width & within_length, above_plane, -math.inf)
+    row, col = np.unravel_index(under.argmax(), under.shape)  # the first NaN, if there is one
+    return float(under[row, col]), (int(row) + rows.start, int(col) + cols.start)
 
 
 def window(position: float, radius: float, nodes: int, cell_size: float) -> slice:

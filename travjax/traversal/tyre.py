@@ -16,7 +16,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from travjax.batching import rounded
 from travjax.simulation.actions import ActionSpace
-from travjax.simulation.arcs import (
+from travjax.simulation.events import Margins, Nodes, Pose, Where, larger
+from travjax.simulation.footprint import Layout, View
+from travjax.simulation.robot import Robot
+from travjax.simulation.setup import Setup
+from travjax.simulation.tyre_tables import Places, TyreTable, tyre_table
+from travjax.traversal.arcs import (
     UNKNOWN_HEIGHT,
     Poses,
     above_centre,
@@ -29,12 +34,7 @@ from travjax.simulation.arcs import (
     view_lanes,
     where_of,
 )
-from travjax.simulation.events import Margins, Nodes, Pose, Where, larger
-from travjax.simulation.footprint import Layout, View
-from travjax.simulation.robot import Robot
-from travjax.simulation.setup import Setup
-from travjax.simulation.steps import step_heights, without_gaps
-from travjax.simulation.tyre_tables import Places, TyreTable, tyre_table
+from travjax.traversal.steps import step_heights, without_gaps
 
 ROUNDS = 2
 """How often wheels are put on the ground: slopes follow from resting heights, and resting heights from slopes."""

@@ -1,7 +1,7 @@
 """Sequential float64 simulator of the contact model tyre (SPEC section 15): the oracle for the batched kernel.
 
 It computes one trajectory and one pose at a time in plain NumPy, and shares no code with the kernel. Poses along the
-arcs and the heights' datum are those of travjax.simulation.reference. `robot` and `actions` are any objects with the
+arcs and the heights' datum are those of travjax.traversal.reference. `robot` and `actions` are any objects with the
 attributes of travjax.Robot and travjax.ActionSpace; a robot's `overhang_height` (None is its ride height) and
 `nose_rise` (0) may be left out.
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from travjax.simulation.reference import (
+from travjax.traversal.reference import (
     UNKNOWN_MARGINS,
     Margins,
     TrajectoryMargins,

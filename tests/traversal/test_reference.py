@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from travjax.simulation import reference
+from travjax.traversal import reference
 
 CELL = 0.0625
 LENGTH = 1.65

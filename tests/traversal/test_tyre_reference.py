@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from travjax import ActionSpace, Robot
-from travjax.simulation import tyre_reference as tyre
-from travjax.simulation.reference import label
+from travjax.traversal import tyre_reference as tyre
+from travjax.traversal.reference import label
 
 ROBOT = Robot.load("seekur_jr")
 RADIUS = ROBOT.wheel_diameter / 2.0
