@@ -43,7 +43,7 @@ class Setup:
     def chosen(robot: Robot | str | None, actions: ActionSpace | None, grid: Grid) -> "Setup":
         """Returns the setup that the arguments of a public function stand for.
 
-        robot: a Robot, or the name or file of one; the Seekur Jr for None
+        robot:   a Robot, or the name or file of one; the Seekur Jr for None
         actions: the paper's action space for None
         Raises InputError as `Robot.load` does, and if actions are no ActionSpace.
         """
