@@ -8,6 +8,7 @@ from travjax.config import require
 from travjax.data.map_batches import MapStream, WindowOptions
 from travjax.files import user_path
 from travjax.rasters.reading_options import AXES_UP, DemOptions
+from travjax.simulation.contact import CONTACTS
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
@@ -64,6 +65,23 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
+    add_contact(parser)
+
+
+def add_contact(parser: Options) -> None:
+    """Adds the options for the contact model; see `setup`."""
+    parser.add_argument(
+        "--contact",
+        choices=CONTACTS,
+        help="how wheels and body touch the ground: as in the paper (nearest), or with the wheels' size, the whole "
+        "outline and the point turn (tyre); the robot's file decides unless given, else nearest",
+    )
+    parser.add_argument(
+        "--no-turn",
+        dest="turn",
+        action="store_false",
+        help="leave point turns out of --contact tyre, as the paper does",
+    )
 
 
 GROWS = "features of synthetic maps grow with it, unless a world is given"
@@ -78,7 +96,7 @@ def add_grid(parser: Options) -> None:
     )
 
 
-RUN_OPTIONS = ("robot", "actions", "size", "spacing", "weights", "seed")
+RUN_OPTIONS = ("robot", "actions", "size", "spacing", "contact", "turn", "weights", "seed")
 """Names of the options that `add_run` adds."""
 
 
@@ -87,6 +105,7 @@ def add_run(parser: Options) -> None:
     parser.add_argument("--robot", metavar="R", help="another robot than the preset's: its name or a .toml file")
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     add_grid(parser)
+    add_contact(parser)
     parser.add_argument(
         "--weights",
         metavar="FILE",
@@ -171,8 +190,9 @@ def seed(arguments: argparse.Namespace) -> int:
 
 
 def setup(arguments: argparse.Namespace) -> Setup:
-    """Returns robot, action space and grid; raises InputError early where they do not fit together."""
-    return Setup.load(arguments.robot, arguments.actions, arguments.size, arguments.spacing)
+    """Returns robot, action space, grid and contact model; raises InputError early where they do not fit together."""
+    where = arguments.size, arguments.spacing
+    return Setup.load(arguments.robot, arguments.actions, *where, arguments.contact, arguments.turn)
 
 
 def windows(arguments: argparse.Namespace) -> WindowOptions:

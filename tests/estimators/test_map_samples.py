@@ -13,9 +13,8 @@ from travjax.config import InputError
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.estimators.map_samples import MapSamples, MapSource
 from travjax.models.pose_stencil import stencil
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.footprint import View, views_of
-from travjax.simulation.grid import Grid
+from travjax.simulation.setup import Setup
 from travjax.traversal.traverse import failures, simulate, unpacked
 
 CLEAN = replace(PRESET, corruption=CorruptionConfig(0.0))
@@ -53,11 +52,12 @@ def above_centre(one: np.ndarray) -> np.ndarray:
 def test_labels_of_another_view_are_permuted_labels_of_the_map(size, maps):
     """Verified by labelling the turned and the mirrored map anew."""
     if size == "paper":
-        robot, actions, grid = SEEKUR_JR, ActionSpace(), Grid()
+        setup = Setup(SEEKUR_JR)
         heights = np.stack([maps[name] for name in ("mountain_crater", "scattered_sharp", "holes")])
     else:
-        robot, actions, grid = SETUP
+        setup = SETUP
         heights = dataset().heights[:8]
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     views = views_of(actions)
     assert len(views) == 4
     seen = np.stack([np.flip(heights, tuple(axis + 1 for axis in view.flipped)) for view in views])

@@ -109,7 +109,7 @@ def test_a_stream_labels_every_map_once_and_reports_its_progress(monkeypatch):
     monkeypatch.setattr(
         simulator_benchmark, "packed", lambda *labels: stored.append(np.asarray(packed(*labels))) or stored[-1]
     )
-    row = simulator_benchmark.stream_row(3, FRAIL, FEW, GRID, done.append)
+    row = simulator_benchmark.stream_row(3, replace(SETUP, robot=FRAIL), done.append)
     assert is_whole(row)
     assert row["maps"] == 3
     assert done == [2, 1]

@@ -6,6 +6,7 @@ from travjax import options
 from travjax.config import require
 from travjax.estimators.names import ESTIMATORS
 from travjax.files import user_path
+from travjax.simulation.contact import CONTACTS
 from travjax.simulation.robot import Robot
 
 
@@ -29,6 +30,7 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument("--model", choices=ESTIMATORS, help="what the estimator must be")
     parser.add_argument("--robot", metavar="R", help="what the estimator must have been trained for")
+    parser.add_argument("--contact", choices=CONTACTS, help="contact model that it must have been trained for")
     parser.add_argument(
         "--check",
         action="store_true",
@@ -49,6 +51,7 @@ def run(arguments: argparse.Namespace) -> None:
     predictor = Predictor.load(arguments.checkpoint)
     model = predictor.run.preset.model
     require(arguments.model in (None, model), "--model", arguments.model, f"{model}, which the estimator is")
-    predictor.require_trained_for(Robot.load(arguments.robot) if arguments.robot else None)
+    robot = Robot.load(arguments.robot) if arguments.robot else None
+    predictor.require_trained_for(robot, contact=arguments.contact)
     maps = options.maps(arguments, predictor.run.grid)
     predict_maps(maps, predictor, arguments.out, arguments.check, figures=not arguments.no_figures)

@@ -240,7 +240,7 @@ def configs_to_json(dataset: Dataset) -> dict[str, Any]:
 def dataset_from_arrays(table: dict[str, Any], arrays: dict[str, np.ndarray]) -> Dataset:
     """Restores a data set from its arrays and the output of `configs_to_json`; raises InputError for anything else."""
     synthetic = table.get("config") is not None
-    parts = parts_from_json(table, PARTS | ({"config": DatasetConfig} if synthetic else {}))
+    parts = parts_from_json(Setup.parts_of(table), PARTS | ({"config": DatasetConfig} if synthetic else {}))
     config = parts.pop("config", None)
     places = {name: array for name, array in arrays.items() if name in PROVENANCE_ARRAYS}
     provenance = Provenance.from_json(table["provenance"], **places) if "provenance" in table else None

@@ -25,7 +25,6 @@ from travjax.estimators.kind import Batch
 from travjax.estimators.preset import Preset
 from travjax.jax_flags import usual_flags
 from travjax.models.pose_stencil import Stencil, stencil
-from travjax.simulation.footprint import views_of
 from travjax.simulation.setup import Setup
 from travjax.traversal.traverse import margins_of
 
@@ -114,7 +113,7 @@ class MapSamples:
     def prepared(self, maps: np.ndarray, step: int):
         """Prepares inputs and targets of a step, counted over the whole training, on maps [b]."""
         data, preset, rng = self.dataset, self.preset, np.random.default_rng((self.config.seed, step))
-        views = views_of(data.actions)
+        views = data.setup.views
         view = views[rng.integers(len(views))]
         heights = np.ascontiguousarray(np.rot90(data.heights[maps], int(rng.integers(4)), axes=(1, 2)))
         margins = margins_of(heights, data.setup)

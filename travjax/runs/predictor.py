@@ -15,6 +15,7 @@ from travjax.models.variables import Network
 from travjax.runs.model_file import SUFFIX, read_model
 from travjax.runs.run import Run, load_estimator
 from travjax.simulation.actions import ActionSpace
+from travjax.simulation.contact import Contact
 from travjax.simulation.grid import HIGHEST, Grid
 from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
@@ -70,18 +71,25 @@ class Predictor:
         return Predictor(*read_model(path)[:2], path)
 
     def require_trained_for(
-        self, robot: Robot | None = None, actions: ActionSpace | None = None, grid: Grid | None = None
+        self,
+        robot: Robot | None = None,
+        actions: ActionSpace | None = None,
+        grid: Grid | None = None,
+        contact: str | None = None,
     ):
-        """Raises InputError when robot, actions or grid differ from what the estimator was trained for; it names
-        both.
+        """Raises InputError when robot, actions, grid or contact model differ from what the estimator was trained for;
+        it names both.
         """
         own = self.run.setup
-        given = Setup(robot or own.robot, actions or own.actions, grid or own.grid)
+        model = Contact.from_model(contact, own.contact.turn) if contact else own.contact
+        given = Setup(robot or own.robot, actions or own.actions, grid or own.grid, model)
         for part, *_ in own.differences(given):
             wanted, other = getattr(own, part), getattr(given, part)
             if part == "robot":
                 same = " of other dimensions or limits" if other.name == wanted.name else ""
                 wanted, other = f"{wanted.name}{same}", other.name
+            if part == "contact":
+                wanted, other = wanted.model, other.model
             require(False, part, other, f"{wanted}, which the estimator was trained for")
 
     @usual_flags()

@@ -74,7 +74,7 @@ class Run:
 
         Raises InputError for any other table.
         """
-        parts = parts_from_json(table, {"preset": Preset} | PARTS, where)
+        parts = parts_from_json(Setup.parts_of(table), {"preset": Preset} | PARTS, where)
         return Run(parts.pop("preset"), Setup(**parts))
 
     @staticmethod

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from travjax.config import require
 
-MODELS = ("nearest", "tyre")
+CONTACTS = ("nearest", "tyre")
 """The paper's model (nearest.py), and that of a robot that is to drive (tyre.py)."""
 
 
@@ -34,4 +34,6 @@ class Contact:
 
 def require_contact(model: object) -> None:
     """Raises InputError unless it is the name of a contact model."""
-    require(isinstance(model, str) and model in MODELS, "contact", model, " or ".join(f'"{name}"' for name in MODELS))
+    require(
+        isinstance(model, str) and model in CONTACTS, "contact", model, " or ".join(f'"{name}"' for name in CONTACTS)
+    )

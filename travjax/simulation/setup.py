@@ -13,7 +13,7 @@ from typing import Any
 from travjax.config import InputError, one_line, require, to_json
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.contact import Contact
-from travjax.simulation.footprint import NodeTable, node_table
+from travjax.simulation.footprint import NodeTable, View, node_table, views_of
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.simulation.tyre_tables import require_inside
@@ -52,7 +52,7 @@ class Setup:
     ) -> "Setup":
         """Returns the setup that the arguments of a public function stand for.
 
-        robot: a Robot, or the name or file of one; the Seekur Jr for None
+        robot:   a Robot, or the name or file of one; the Seekur Jr for None
         actions: the paper's action space for None
         contact: a contact model; that of the robot's file for None, and where it has none the paper's
         turn:    whether point turns are simulated, by the contact models that can
@@ -97,6 +97,14 @@ class Setup:
         """
         return node_table(self.robot, self.actions, self.grid)
 
+    @property
+    def views(self) -> tuple[View, ...]:
+        """The views of a map in which its trajectories have the same margins as those that correspond to them.
+
+        A point turn begins facing forward, so a map that is turned by 180 degrees is another one for it.
+        """
+        return tuple(view for view in views_of(self.actions) if not (self.contact.turn and view.turned))
+
     def require_fit(self) -> None:
         """Raises InputError when robot, actions and grid do not fit together."""
         table = self.node_table()
@@ -122,6 +130,11 @@ class Setup:
             pairs = [(f"{name} = {mine!r}", f"{name} = {given!r}") for _, name, mine, given in fields]
             ours, theirs = (one_line(", ".join(side), 160) for side in zip(*pairs, strict=True))
             raise InputError(f"{part} of the {what}: {ours}; must be as here: {theirs}")
+
+    @staticmethod
+    def parts_of(table: Any) -> Any:
+        """Returns saved settings with the paper's contact model where they are older than contact models."""
+        return {"contact": to_json(Contact())} | table if isinstance(table, dict) else table
 
     def to_json(self) -> dict[str, Any]:
         """Converts the setup to what JSON can hold, part by part; a straight arc's radius becomes "inf"."""

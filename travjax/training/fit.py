@@ -31,13 +31,15 @@ def run_from_preset(
     actions: str | Path | None = None,
     size: float = 8.0,
     spacing: float = 0.0625,
+    contact: str | None = None,
+    turn: bool = True,
     weights: str | None = None,
     seed: int | None = None,
 ) -> Run:
     """Returns the run of a preset, with any settings that are to differ from it.
 
     preset:  a preset, or its TOML file
-    robot, actions, size, spacing: as `Setup.load` takes them; the preset's robot unless given
+    robot, actions, size, spacing, contact, turn: as `Setup.load` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
     seed:    seed of the data set and of training
     Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
@@ -51,7 +53,7 @@ def run_from_preset(
             preset, dataset=replace(preset.dataset, seed=seed), training=replace(preset.training, seed=seed)
         )
     preset = replace(preset, robot=robot or preset.robot)
-    return Run(preset, Setup.load(preset.robot, actions, size, spacing))
+    return Run(preset, Setup.load(preset.robot, actions, size, spacing, contact, turn))
 
 
 @usual_flags()
