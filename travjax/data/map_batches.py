@@ -22,7 +22,7 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
 from travjax.terrain.rock_field import rock_fields, sample_rock_field
 from travjax.terrain.styles import FIELDS, are_rock_fields, elevation, sample_params, world_note
-from travjax.traversal.traverse import failures, margins_of
+from travjax.traversal.traverse import failures, margins_of, places_of
 
 Batch = dict[str, np.ndarray]
 
@@ -169,12 +169,17 @@ def dem_batches(sites: Iterable[tuple[str, Windows]]) -> Iterator[Batch]:
             }
 
 
-def labelled(batch: Batch, setup: Setup) -> Batch:
+def labelled(batch: Batch, setup: Setup, where: bool = False) -> Batch:
     """Adds to a batch `known` and the margin of each of the robot's k events by name, [n, t], and `failed` [n, t, k].
 
+    where: whether also to add `where_pose` [n, t, k] and `where_node` [n, t, k, 2], as in events.Where, int16
     Raises InputError when a margin is NaN or infinite where the ground is known: it would not count as a failure.
     """
-    margins = margins_of(batch["heights"], setup)
+    if where:
+        margins, places = places_of(batch["heights"], setup)
+        found = {"where_pose": places.pose, "where_node": places.node}
+    else:
+        margins, found = margins_of(batch["heights"], setup), {}
     numbers = np.isfinite(np.asarray(margins.events())).all(axis=-1)
     allowed = "finite where the ground is known"
     require(
@@ -182,12 +187,15 @@ def labelled(batch: Batch, setup: Setup) -> Batch:
     )
     arrays = {name: margins[name] for name in margins.names}
     arrays |= {"known": margins.known, "failed": failures(margins, setup.robot)}
-    return batch | {name: np.asarray(array) for name, array in arrays.items()}
+    where_arrays = {name: np.asarray(array).astype(np.int16) for name, array in found.items()}
+    return batch | {name: np.asarray(array) for name, array in arrays.items()} | where_arrays
 
 
-def bytes_each(setup: Setup) -> int:
-    """Returns the bytes of a labelled map: heights, and per trajectory `known` and each event's margin and flag."""
-    return 4 * setup.grid.nodes**2 + len(setup.actions) * (5 * len(setup.robot.events) + 1)
+def bytes_each(setup: Setup, where: bool = False) -> int:
+    """Returns the bytes of a labelled map: heights, and per trajectory `known`, and of each event margin and flag, and
+    with `where` a pose and a node.
+    """
+    return 4 * setup.grid.nodes**2 + len(setup.actions) * ((11 if where else 5) * len(setup.robot.events) + 1)
 
 
 def joined(batches: list[Batch]) -> Batch:

@@ -72,10 +72,12 @@ def labelled_maps(
     known: np.ndarray,
     titles: Sequence[str],
     setup: Setup,
+    poses: np.ndarray | None = None,
 ) -> Figure:
     """Draws each map's elevation and, for each event, the action space coloured as safe, failed or unknown.
 
-    heights: [n, rows, cols]; failed: [n, t, k] for the robot's k events; known: [n, t]
+    heights: [n, rows, cols]; failed: [n, t, k] for the robot's k events; known: [n, t]; poses: [n, t, k] where each
+    margin is reached (events.Where), from where on failing trajectories are coloured; all of them unless given
     Source: the paper's qualitative figure.
     """
     robot, actions, grid = setup.robot, setup.actions, setup.grid
@@ -92,14 +94,19 @@ def labelled_maps(
         for event, name in enumerate(robot.event_names):
             ax = axes[row, 1 + event]
             _draw_elevation(ax, one, grid, low, high, colour="gray", alpha=0.35)
-            _draw_paths(ax, paths, _by_label(failed[row, :, event], known[row]))
+            if poses is None:
+                _draw_paths(ax, paths, _by_label(failed[row, :, event], known[row]))
+            else:
+                _draw_paths_from(ax, paths, failed[row, :, event], known[row], poses[row, :, event])
             ax.set_title(_share_title(name, failed[row, :, event], known[row]), fontsize=9)
         axes[row, 0].set_ylabel("y, forward [m]")
     for ax in axes[-1]:
         ax.set_xlabel("x, right [m]")
-    legend = [Line2D([], [], color=colour, label=text) for colour, text in _KINDS]
+    kinds = _KINDS if poses is None else (_KINDS[0], (FAILED, "failed, from its largest margin on"), _KINDS[2])
+    legend = [Line2D([], [], color=colour, label=text) for colour, text in kinds]
     figure.legend(handles=legend, loc="outside upper right", ncols=3, frameon=False)
-    figure.suptitle(f"{len(actions)} trajectories of {robot.name}", x=0.02, ha="left")
+    contact = f", contact model {setup.contact.model}"
+    figure.suptitle(f"{len(actions)} trajectories of {robot.name}{contact}", x=0.02, ha="left")
     return figure
 
 
@@ -203,6 +210,16 @@ def _by_probability(probability: np.ndarray, known: np.ndarray) -> dict[str, np.
 def _draw_paths(ax, paths: np.ndarray, by_colour: dict[str, np.ndarray]) -> None:
     for colour, mask in by_colour.items():
         ax.add_collection(LineCollection(paths[mask], colors=colour, linewidths=0.25, alpha=0.7))
+
+
+def _draw_paths_from(ax, paths: np.ndarray, failed: np.ndarray, known: np.ndarray, poses: np.ndarray) -> None:
+    """Draws paths, the failing ones as failed only from the pose on where their margin is reached."""
+    _draw_paths(ax, paths, {UNKNOWN_COLOUR: ~known, SAFE: known})
+    last = paths.shape[1] - 2  # a line has two ends
+    ends = [
+        path[min(max(pose, 0), last) :] for path, pose in zip(paths[failed & known], poses[failed & known], strict=True)
+    ]
+    ax.add_collection(LineCollection(ends, colors=FAILED, linewidths=0.25, alpha=0.7))
 
 
 def _draw_robot(ax, robot: Robot) -> None:

@@ -51,16 +51,18 @@ def label_maps(maps: MapStream, setup: Setup, out: str | Path, figures: bool = T
     """
     folder, robot = output_folder(out), setup.robot
     config = setup.to_json_text(files=maps.files, world=maps.world)
-    with NpzStream(folder / "labels.npz", maps.total, bytes_each(setup), "labelled maps") as labels:
-        for batch in _counted((labelled(one, setup) for one in maps.batches), maps.total, "labelling"):
+    with NpzStream(folder / "labels.npz", maps.total, bytes_each(setup, where=True), "labelled maps") as labels:
+        for batch in _counted((labelled(one, setup, where=True) for one in maps.batches), maps.total, "labelling"):
             labels.append(batch)
         arrays = labels.arrays
         in_paper = maps.paper and setup.as_in_paper
         table = tables.shares_table(arrays["group"], arrays["failed"], arrays["known"], in_paper, robot.event_names)
+        places = tables.where_table(arrays["where_pose"], arrays["failed"], setup)
         labels.save(config=config, cell_size=setup.grid.spacing)
-        shares = save_text(folder / "shares.txt", table + "\n")
+        shares = save_text(folder / "shares.txt", f"{table}\n\n{places}\n")
         progress.say(
-            f"\nShare of trajectories that fail, {robot.name}, {len(setup.actions)} trajectories a map:\n{table}\n"
+            f"\nShare of trajectories that fail, {robot.name}, {len(setup.actions)} trajectories a map, contact model "
+            f"{setup.contact.model}:\n{table}\n\nWhere they reach the margin that fails:\n{places}\n"
         )
         unknown = int((~arrays["known"].any(axis=-1)).sum())
         if unknown:
@@ -85,9 +87,8 @@ def _write_figures(maps: Batch, setup: Setup, out: Path) -> None:
 
     chosen = samples(maps)
     titles = [title(maps, index) for index in chosen]
-    heights, failed, known = (maps[key][chosen] for key in ("heights", "failed", "known"))
-    progress.wrote(
-        map_figures.save(map_figures.labelled_maps(heights, failed, known, titles, setup), out / "labels.png")
-    )
+    heights, failed, known, poses = (maps[key][chosen] for key in ("heights", "failed", "known", "where_pose"))
+    labels = map_figures.labelled_maps(heights, failed, known, titles, setup, poses)
+    progress.wrote(map_figures.save(labels, out / "labels.png"))
     progress.wrote(map_figures.save(map_figures.robot_figure(setup.robot), out / "robot.png"))
     progress.wrote(map_figures.save(map_figures.action_figure(setup), out / "actions.png"))

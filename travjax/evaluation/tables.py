@@ -9,6 +9,7 @@ from tabulate import tabulate
 from travjax.config import QUOTED, one_line
 from travjax.evaluation.metrics import OVERALL, PAPER_SYNTHETIC, Confusion, Evaluation, OperatingPoint
 from travjax.simulation.events import EVENTS
+from travjax.simulation.setup import Setup
 
 ANY = "any failure"
 
@@ -67,6 +68,28 @@ def _shares(name: str, counts: np.ndarray, trajectories: int) -> list:
         f"{none.mean():.1%}",
         f"{known / (len(counts) * trajectories):.1%}",
     ]
+
+
+def where_table(poses: np.ndarray, failed: np.ndarray, setup: Setup) -> str:
+    """Tabulates, for each event, on which part of a trajectory its margin is reached where it fails.
+
+    poses: [n, t, k] of events.Where; failed: [n, t, k], False where unknown
+    """
+    junction = len(setup.actions.first_stations())
+    ends = {"point turn": -1, "first arc": junction - 1, "second arc": np.iinfo(np.int16).max}
+    counts = np.zeros((len(ends), failed.shape[-1]), int)
+    for start in range(0, len(failed), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        part = np.searchsorted(list(ends.values()), np.asarray(poses[some]))
+        counts += np.stack(
+            [((part == which) & np.asarray(failed[some])).sum(axis=(0, 1)) for which in range(len(ends))]
+        )
+    totals = counts.sum(axis=0)
+    rows = [
+        [name, *(f"{count / total:.1%}" if total else "-" for count in of_event)]
+        for name, of_event, total in zip(setup.robot.event_names, counts.T, totals, strict=True)
+    ]
+    return _table(rows, ["", *ends])
 
 
 def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:

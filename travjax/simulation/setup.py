@@ -22,6 +22,10 @@ PARTS: dict[str, type] = {"robot": Robot, "actions": ActionSpace, "grid": Grid, 
 """The parts of a setup by name, in the order of its fields and of saved files."""
 
 
+ONLY_TYRE = frozenset({"overhang_height", "nose_rise"})
+"""Fields of a robot that only the contact model `tyre` uses."""
+
+
 @lru_cache(maxsize=1)
 def default_robot() -> Robot:
     """Returns the Seekur Jr, the paper's robot."""
@@ -114,14 +118,18 @@ class Setup:
     @property
     def as_in_paper(self) -> bool:
         """Whether all but the grid is the paper's, so that figures on synthetic maps can be compared with its own."""
-        return (self.robot, self.actions, self.contact) == (default_robot(), ActionSpace(), Contact())
+        return not any(self.differences(Setup(default_robot(), grid=self.grid)))
 
     def differences(self, other: "Setup") -> Iterator[tuple[str, str, Any, Any]]:
-        """Yields part, field, value here and value there for each field in which another setup differs."""
+        """Yields part, field, value here and value there for each field in which another setup differs.
+
+        What the robot's file says only for another contact model does not count.
+        """
+        unused = {"contact"} | (set() if "tyre" in (self.contact.model, other.contact.model) else ONLY_TYRE)
         for part in PARTS:
             mine, others = getattr(self, part), getattr(other, part)
             for name in (field.name for field in dataclasses.fields(mine)):
-                if getattr(mine, name) != getattr(others, name):
+                if not (part == "robot" and name in unused) and getattr(mine, name) != getattr(others, name):
                     yield part, name, getattr(mine, name), getattr(others, name)
 
     def require_same(self, wanted: "Setup", what: str) -> None:
