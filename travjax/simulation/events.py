@@ -49,6 +49,12 @@ class Pose:
     clearance: jax.Array
     nodes: Nodes | None = None
 
+    @property
+    def places(self) -> Nodes:
+        """The nodes, which somebody asked for."""
+        assert self.nodes is not None
+        return self.nodes
+
 
 @dataclass(frozen=True)
 class Event:
@@ -69,7 +75,7 @@ class Event:
     limit: str
     value: Callable[[Pose], jax.Array]
     margin: Callable[[jax.Array], jax.Array] = lambda largest: largest
-    node: Callable[[Pose], jax.Array] = lambda pose: pose.nodes.centre
+    node: Callable[[Pose], jax.Array] = lambda pose: pose.places.centre
 
     def shown(self, margin: float) -> str:
         """Formats a margin, or an error of one, in metres or degrees."""
@@ -83,8 +89,8 @@ def larger(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def _stepping_node(pose: Pose) -> jax.Array:
     """Returns the node under the wheel that has the largest change."""
-    change, node = jnp.abs(pose.change[0]), pose.nodes.wheels[0]
-    for other, there in zip(pose.change[1:], pose.nodes.wheels[1:], strict=True):
+    change, node = jnp.abs(pose.change[0]), pose.places.wheels[0]
+    for other, there in zip(pose.change[1:], pose.places.wheels[1:], strict=True):
         node = jnp.where(jnp.abs(other) > change, there, node)
         change = larger(jnp.abs(other), change)
     return node
@@ -92,7 +98,7 @@ def _stepping_node(pose: Pose) -> jax.Array:
 
 PAPER = (
     Event("step", "m", "max_step", lambda pose: reduce(larger, map(jnp.abs, pose.change)), node=_stepping_node),
-    Event("obstacle", "m", "ride_height", lambda pose: pose.clearance, node=lambda pose: pose.nodes.body),
+    Event("obstacle", "m", "ride_height", lambda pose: pose.clearance, node=lambda pose: pose.places.body),
     Event("tilt", "rad", "max_tilt", lambda pose: pose.steepness, lambda largest: jnp.arctan(jnp.sqrt(largest))),
 )
 """The events of the paper (SPEC section 5), which every robot has."""

@@ -4,6 +4,7 @@ It is computed by the sequential simulators (reference.py, tyre_reference.py), s
 `simulate` to rounding.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,7 +80,8 @@ def traverse(
 
 
 def _by_nearest(ground: np.ndarray, setup: Setup, poses: np.ndarray) -> Traverse:
-    states = [reference.pose_state(ground, setup.robot, *pose, setup.grid.spacing) for pose in poses.tolist()]
+    robot, spacing = setup.robot, setup.grid.spacing
+    states = [reference.pose_state(ground, robot, x, y, heading, spacing) for x, y, heading in poses.tolist()]
     contact = np.array([state.contacts for state in states])
     change = np.abs(np.diff(contact, axis=0, prepend=contact[:1]))
     step_node = np.take_along_axis(np.array([s.nodes for s in states]), change.argmax(axis=1)[:, None, None], axis=1)
@@ -89,17 +91,32 @@ def _by_nearest(ground: np.ndarray, setup: Setup, poses: np.ndarray) -> Traverse
 def _by_tyre(ground: np.ndarray, setup: Setup, poses: np.ndarray, turning: int) -> Traverse:
     robot, spacing = setup.robot, setup.grid.spacing
     steps = tyre_reference.step_heights(ground, robot.wheel_diameter / 2, spacing)
-    states = [tyre_reference.pose_state(ground, robot, *pose, spacing, steps) for pose in poses.tolist()]
+    states = [
+        tyre_reference.pose_state(ground, robot, x, y, heading, spacing, steps) for x, y, heading in poses.tolist()
+    ]
     contact, step = np.array([state.resting for state in states]), np.array([state.step for state in states])
     return _traverse(states, poses, turning, contact, step, np.array([s.step_node or (-1, -1) for s in states]))
 
 
 def _traverse(states, poses: np.ndarray, turning: int, contact, step, step_node) -> Traverse:
     known = np.array([state.known for state in states])
-    pitch, roll, tilt, obstacle = np.array(
-        [(np.arctan(s.pitch_slope), np.arctan(s.roll_slope), s.tilt, s.clearance) for s in states]
-    ).T
-    numbers = [np.where(known, number, np.nan) for number in (pitch, roll, tilt, step, obstacle)]
-    obstacle_node = np.array([state.clearance_node or (-1, -1) for state in states])
-    nodes = [np.where(known[:, None], node, -1) for node in (step_node, obstacle_node)]
-    return Traverse(poses, turning, np.where(known[:, None], contact, np.nan), *numbers, *nodes, known)
+
+    def field(value: Callable) -> np.ndarray:
+        return np.where(known, [value(state) for state in states], np.nan)
+
+    def nodes(node: np.ndarray) -> np.ndarray:
+        return np.where(known[:, None], node, -1)
+
+    return Traverse(
+        pose=poses,
+        turning=turning,
+        contact=np.where(known[:, None], contact, np.nan),
+        pitch=field(lambda state: np.arctan(state.pitch_slope)),
+        roll=field(lambda state: np.arctan(state.roll_slope)),
+        tilt=field(lambda state: state.tilt),
+        step=np.where(known, step, np.nan),
+        obstacle=field(lambda state: state.clearance),
+        step_node=nodes(step_node),
+        obstacle_node=nodes(np.array([state.clearance_node or (-1, -1) for state in states])),
+        known=known,
+    )

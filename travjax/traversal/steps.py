@@ -6,7 +6,6 @@ belongs to the map and the wheel's radius, not to a direction of driving, so it 
 
 import math
 from collections.abc import Callable
-from functools import reduce
 from itertools import product
 
 import jax
@@ -73,9 +72,10 @@ def step_heights(filled: Float[Array, "n r c"], radius: float, spacing: float) -
             slope = jnp.nan_to_num(jnp.maximum(before, after))
             bank = jnp.maximum(jnp.nan_to_num(jnp.minimum(before, after)), n * distance)
             excess = rise - jnp.minimum(jnp.maximum(slope, 0), bank)
-            parts = [at(k) - at(k - 1) for k in range(1 - i, j + 1) if k != 0]
-            steepest = reduce(jnp.logical_and, (arriving >= part for part in parts), True)
-            highest = jnp.where(steepest & (excess > highest), excess, highest)
+            steepest = excess > highest
+            for k in range(1 - i, j + 1):
+                steepest &= arriving >= at(k) - at(k - 1)
+            highest = jnp.where(steepest, excess, highest)
     return highest
 
 

@@ -88,8 +88,15 @@ def tyre_chunks(table: TyreTable, chunks: int) -> TyreChunks:
             *(jnp.asarray(_scan_order(array.reshape(chunks, -1, array.shape[1]))) for array in vars(places).values())
         )
 
-    names = ("centre", "offset", "axes", "corner", "within")
-    return TyreChunks(*(cut(getattr(table, name)) for name in names), scan(table.tyres), scan(table.outline))
+    return TyreChunks(
+        centre=cut(table.centre),
+        offset=cut(table.offset),
+        axes=cut(table.axes),
+        corner=cut(table.corner),
+        within=cut(table.within),
+        tyres=scan(table.tyres),
+        outline=scan(table.outline),
+    )
 
 
 def _scan_order(array: np.ndarray) -> np.ndarray:
@@ -191,8 +198,9 @@ def _simulate(
 
 def _with_turns(maxima, places, poses: Poses, turns: _Turns, events) -> tuple[jax.Array, jax.Array | None]:
     """Puts the point turns of trajectories into maxima [E + 1, n, t] and places [2, E, n, t]."""
-    fields = poses.contact, (poses.step,), poses.pitch, poses.roll, poses.steepness, poses.clearance
-    pose = Pose(*fields, poses.nodes)
+    assert poses.step is not None
+    slopes = poses.pitch, poses.roll, poses.steepness
+    pose = Pose(tuple(poses.contact), (poses.step,), *slopes, poses.clearance, poses.nodes)
     passed = jnp.where(turns.passed[..., None], pose_maxima([pose], events)[:, None], -UNKNOWN_HEIGHT)
     turning = passed.max(axis=2)[:, turns.turn].transpose(0, 2, 1)
     if places is not None:
@@ -314,7 +322,7 @@ def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: 
     first = jnp.full_like(east, -UNKNOWN_HEIGHT), jnp.zeros_like(east), nowhere
     above, reached, at = jax.lax.scan(scan, first, chunk.tyres)[0]
     above, reached = (field.reshape(-1, 4, field.shape[-1]) for field in (above, reached))
-    if where:
+    if at is not None:
         largest = reached.argmax(axis=1, keepdims=True)
         at = jnp.take_along_axis(at.reshape(reached.shape), largest, axis=1)[:, 0]
     return jax.lax.optimization_barrier((above, reached.max(axis=1), at))
