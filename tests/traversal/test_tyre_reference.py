@@ -1,6 +1,7 @@
 """The sequential simulator of the contact model tyre against planes, kerbs, walls, stairs, trenches and symmetries."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from travjax import ActionSpace, Robot
 from travjax.traversal import tyre_reference as tyre
 from travjax.traversal.reference import label
 
-ROBOT = Robot.load("seekur_jr")
+ROBOT = replace(Robot.load("seekur_jr"), nose_rise=None)
 RADIUS = ROBOT.wheel_diameter / 2.0
 SPACINGS = [0.04, 0.0625, 0.1]
 STRAIGHT = ActionSpace(turns=4, arc_lengths=(0.3, 0.3), radii=(math.inf,), interval=0.06)
@@ -77,14 +78,14 @@ def test_parts_of_a_turn_are_equal_and_at_most_five_degrees():
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
-@pytest.mark.parametrize("degrees", [0.0, 10.0, 25.0, 40.0])
+@pytest.mark.parametrize("degrees", [0.0, 10.0, 25.0, 40.0, 60.0])
 def test_planes_have_their_tilt_no_step_and_no_obstacle(spacing, degrees):
     for azimuth in np.radians([0.0, 33.0, 90.0, 135.0, 260.0]):
         heights = plane(spacing, degrees, azimuth)
-        steps = tyre.step_heights(heights, RADIUS, spacing)
-        assert inner(steps, spacing).max() < 1e-9
+        ground = tyre.ground_of(heights, ROBOT, spacing)
+        assert inner(ground.steps, spacing).max() < 1e-9
         for pose in POSES:
-            state = tyre.pose_state(heights, ROBOT, *pose, spacing, steps)
+            state = tyre.pose_state(ground, ROBOT, *pose, spacing)
             assert state.step < 1e-9
             assert state.tilt == pytest.approx(math.radians(degrees), abs=1e-9)
             assert state.clearance == pytest.approx(0.0, abs=1e-9)
@@ -140,7 +141,7 @@ def test_a_node_under_a_tyre_counts_only_where_the_tyre_reaches_it():
     for ahead, touched in ((0.15, True), (0.21, False), (0.25, False)):
         spacing = 0.01
         heights = kerb(spacing, 0.11, distance=ROBOT.wheelbase / 2.0 + ahead, half=1.0)
-        state = tyre.pose_state(heights, ROBOT, 0.0, 0.0, 0.0, spacing)
+        state = tyre.pose_state(tyre.ground_of(heights, ROBOT), ROBOT, 0.0, 0.0, 0.0, spacing)
         assert (state.step > 0.0) is touched
 
 
@@ -171,7 +172,7 @@ def test_a_wall_before_the_nose_at_the_end_of_the_path_is_never_safe(spacing, qu
     """It stands within the overall length, beyond the chassis where the grid has such a node, and beyond the tyres."""
     x, y = nodes(spacing)
     right, forward = [(x, y), (y, -x), (-x, -y), (-y, x)][quarter]
-    end = 0.6 + ROBOT.overall_length / 2.0
+    end = 0.6 + ROBOT.overall_length / 2.0 + spacing / 2.0  # a node stands for its cell
     first = np.floor(end / spacing + 1e-9) * spacing
     assert first > 0.6 + ROBOT.wheelbase / 2.0 + RADIUS
     margins = simulated(1.5 * (forward > first - 1e-6), trajectory=quarter, spacing=spacing)
@@ -246,10 +247,49 @@ def test_a_stone_of_one_node_has_its_height():
     assert simulated(heights).step == pytest.approx(0.13)
 
 
-def test_closing_leaves_planes_and_edges_as_they_are():
-    for heights in (plane(0.1, 30.0, 2.0), kerb(0.1, 0.2, 1.0), kerb(0.1, 1.0, 4.0, -0.3)):
-        for k in (1, 2, 3, 5):
-            np.testing.assert_allclose(tyre.closed(heights, k), heights, atol=1e-12)
+def test_filling_gaps_leaves_planes_and_edges_as_they_are():
+    downhill = kerb(0.1, 0.2) + plane(0.1, -20.0, math.pi / 2)
+    for heights in (plane(0.1, 30.0, 2.0), kerb(0.1, 0.2, 1.0), kerb(0.1, 1.0, 4.0, -0.3), downhill):
+        for radius in (0.1, 0.2, 0.3, 0.5):
+            found = tyre.filled(heights, radius, 0.1)
+            np.testing.assert_allclose(found[2:-2, 2:-2], heights[2:-2, 2:-2], atol=1e-12)  # rims at the edge are level
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize(("slope", "height"), [(0.2, 0.15), (0.4, 0.2), (0.7, 0.25)])
+def test_a_kerb_whose_upper_side_is_downhill_loses_at_most_the_slope_of_a_cell(spacing, slope, height):
+    _, y = nodes(spacing)
+    step = inner(tyre.step_heights(kerb(spacing, height) - slope * y, RADIUS, spacing), spacing).max()
+    assert height - slope * spacing - 1e-9 <= step <= height
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize("degrees", [62.0, 72.0, 75.0, 80.0, 85.0])
+@pytest.mark.parametrize("foot", [0.0, 0.2, 0.3])
+def test_a_steep_bank_under_the_right_wheels_is_never_safe(spacing, degrees, foot):
+    x, _ = nodes(spacing)
+    bank = np.clip(math.tan(math.radians(degrees)) * (x - foot), 0.0, 1.5)
+    assert any(failures(simulated(bank, spacing=spacing)))
+
+
+def test_a_drop_beside_the_tyre_is_no_step():
+    x, _ = nodes(0.0625)
+    edge = ROBOT.track / 2.0 + ROBOT.wheel_width / 2.0 + 0.1
+    assert simulated(np.where(x > edge, -0.5, 0.0)).step == 0.0
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize("middle", [0.1, 0.4, 0.9])
+def test_a_blurred_kerb_keeps_its_height(spacing, middle):
+    _, y = nodes(spacing)
+    blurred = 0.15 * np.where(y > 0.5 + 1e-6, 1.0, np.where(y > 0.5 - spacing + 1e-6, middle, 0.0))
+    assert tyre.step_heights(blurred, RADIUS, spacing).max() == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("depth", [0.2, 2.0, 5.0])
+def test_a_bridged_trench_under_the_wheels_does_not_bend_the_pose(depth):
+    x, _ = nodes(0.1)
+    assert simulated(np.where(np.abs(x - 0.3) < 0.05, -depth, 0.0), spacing=0.1).tilt < math.radians(1.0)
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -279,7 +319,7 @@ def test_the_overhang_and_the_nose_have_their_own_clearance():
         ({"nose_rise": 0.05}, 0.05 * share),
         ({"overhang_height": 0.128, "nose_rise": 0.05}, 0.02 + 0.05 * share),
     ):
-        state = tyre.pose_state(heights, Carrier(**changes), 0.0, 0.0, 0.0)
+        state = tyre.pose_state(tyre.ground_of(heights, Carrier(**changes)), Carrier(**changes), 0.0, 0.0, 0.0)
         assert state.clearance == pytest.approx(0.15 - lower)
         assert state.clearance_node == (25, 16)
 
@@ -288,11 +328,11 @@ def test_ground_within_the_rectangle_of_a_tyre_is_no_obstacle():
     """A stone 0.1625 m before a wheel's centre, where the tyre's surface is 0.05 m high."""
     heights = np.zeros((33, 33))
     heights[16 + 6, 16 + 5] = 0.12
-    state = tyre.pose_state(heights, ROBOT, 0.0, 0.0, 0.0)
+    state = tyre.pose_state(tyre.ground_of(heights, ROBOT), ROBOT, 0.0, 0.0, 0.0)
     assert state.step == pytest.approx(0.12)
     assert state.step_node == (22, 21)
     np.testing.assert_allclose(state.resting, [0.01, 0.06, 0.01, 0.01], atol=0.005)
-    narrow = tyre.pose_state(heights, Carrier(wheel_width=0.03), 0.0, 0.0, 0.0)
+    narrow = tyre.pose_state(tyre.ground_of(heights, ROBOT), Carrier(wheel_width=0.03), 0.0, 0.0, 0.0)
     assert narrow.clearance_node == (22, 21)  # beside the tyre's rectangle and within the outline
     assert state.clearance_node != (22, 21)
     assert state.clearance < narrow.clearance
@@ -302,7 +342,7 @@ def test_a_tyre_touches_half_a_cell_before_its_front():
     for forward, touched in ((7, True), (8, False)):  # 0.225 and 0.2875 m before a wheel's centre
         heights = np.zeros((33, 33))
         heights[16 + forward, 16 + 5] = 1.5
-        assert (tyre.pose_state(heights, ROBOT, 0.0, 0.0, 0.0).step == 1.5) is touched
+        assert (tyre.pose_state(tyre.ground_of(heights, ROBOT), ROBOT, 0.0, 0.0, 0.0).step == 1.5) is touched
 
 
 @pytest.mark.parametrize("trajectory", range(4))

@@ -90,10 +90,8 @@ def _by_nearest(ground: np.ndarray, setup: Setup, poses: np.ndarray) -> Traverse
 
 def _by_tyre(ground: np.ndarray, setup: Setup, poses: np.ndarray, turning: int) -> Traverse:
     robot, spacing = setup.robot, setup.grid.spacing
-    steps = tyre_reference.step_heights(ground, robot.wheel_diameter / 2, spacing)
-    states = [
-        tyre_reference.pose_state(ground, robot, x, y, heading, spacing, steps) for x, y, heading in poses.tolist()
-    ]
+    whole = tyre_reference.ground_of(ground, robot, spacing)
+    states = [tyre_reference.pose_state(whole, robot, x, y, heading, spacing) for x, y, heading in poses.tolist()]
     contact, step = np.array([state.resting for state in states]), np.array([state.step for state in states])
     return _traverse(states, poses, turning, contact, step, np.array([s.step_node or (-1, -1) for s in states]))
 

@@ -59,6 +59,15 @@ class PoseState:
 UNKNOWN_POSE = PoseState(np.full(4, math.nan), math.nan, math.nan, math.nan, math.nan, None, math.nan, None, False)
 
 
+@dataclass(frozen=True)
+class Ground:
+    """Heights of a map, the same with gaps `filled`, and its steps: [rows, cols] metres, NaN unknown (section 15)."""
+
+    heights: np.ndarray
+    filled: np.ndarray
+    steps: np.ndarray
+
+
 # Trajectories
 
 
@@ -78,12 +87,12 @@ def simulate(
     Raises ValueError as simulate_trajectory does.
     """
     heights = above_centre(heights)
-    steps = step_heights(heights, robot.wheel_diameter / 2.0, cell_size)
+    ground = ground_of(heights, robot, cell_size)
     if trajectories is None:
         trajectories = range(actions.turns * len(actions.radii) ** 2)
     results = []
     for trajectory in trajectories:
-        results.append(_margins(heights, steps, robot, actions, int(trajectory), cell_size, turn))
+        results.append(_margins(ground, robot, actions, int(trajectory), cell_size, turn))
         if on_progress is not None:
             on_progress(len(results))
     return Margins(
@@ -105,8 +114,8 @@ def simulate_trajectory(
     outline or a tyre leaves the map.
     """
     heights = above_centre(heights)
-    steps = step_heights(heights, robot.wheel_diameter / 2.0, cell_size)
-    return _margins(heights, steps, robot, actions, trajectory, cell_size, turn)
+    ground = ground_of(heights, robot, cell_size)
+    return _margins(ground, robot, actions, trajectory, cell_size, turn)
 
 
 def turn_poses(actions, trajectory: int) -> np.ndarray:
@@ -121,16 +130,16 @@ def turn_poses(actions, trajectory: int) -> np.ndarray:
     return np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=1)
 
 
-def _margins(heights, steps, robot, actions, trajectory: int, cell_size: float, turn: bool) -> TrajectoryMargins:
+def _margins(ground: Ground, robot, actions, trajectory: int, cell_size: float, turn: bool) -> TrajectoryMargins:
     path = poses(actions, trajectory)
     if turn:
         path = np.concatenate([turn_poses(actions, trajectory), path])
     for x, y, heading in path.tolist():
-        _check_on_map(heights, robot, x, y, heading, cell_size)
+        _check_on_map(ground.heights, robot, x, y, heading, cell_size)
 
     step, obstacle, tilt = 0.0, -math.inf, 0.0
     for x, y, heading in path.tolist():
-        state = pose_state(heights, robot, x, y, heading, cell_size, steps)
+        state = pose_state(ground, robot, x, y, heading, cell_size)
         if not state.known:
             return UNKNOWN_MARGINS
         step = max(step, state.step)
@@ -158,34 +167,35 @@ def _check_on_map(heights: np.ndarray, robot, x: float, y: float, heading: float
 # Poses
 
 
-def pose_state(
-    heights, robot, x: float, y: float, heading: float, cell_size: float = 0.0625, steps: np.ndarray | None = None
-) -> PoseState:
+def ground_of(heights, robot, cell_size: float = 0.0625) -> Ground:
+    """Returns what a robot drives on: heights [rows, cols] in metres, both odd, NaN is unknown ground."""
+    heights, radius = np.asarray(heights, dtype=np.float64), robot.wheel_diameter / 2.0
+    return Ground(heights, filled(heights, radius, cell_size), step_heights(heights, radius, cell_size))
+
+
+def pose_state(ground: Ground, robot, x: float, y: float, heading: float, cell_size: float = 0.0625) -> PoseState:
     """Computes how the robot stands at one pose: its resting heights, pose plane, clearance and step (section 15).
 
-    heights: [rows, cols] metres, both odd, NaN is unknown ground; x, y in metres, heading in radians
-    steps:   [rows, cols] metres, step_heights of the map, computed here unless given
+    x, y in metres, heading in radians
     """
-    heights = np.asarray(heights, dtype=np.float64)
+    heights = ground.heights
     radius, half_width, half_cell = robot.wheel_diameter / 2.0, robot.wheel_width / 2.0, cell_size / 2.0
-    if steps is None:
-        steps = step_heights(heights, radius, cell_size)
     rows, cols, u, v = _nodes_around(heights.shape, math.hypot(*_reach(robot)) + cell_size, x, y, heading, cell_size)
-    z, steps = heights[rows, cols], steps[rows, cols]
+    z, steps = heights[rows, cols], ground.steps[rows, cols]
 
     on_tyres, in_rectangles = [], np.zeros_like(z, dtype=bool)
     for right, forward in _wheels(robot):
         a, b = u - right, v - forward
         on_tyres.append((np.abs(a) <= half_width + half_cell + TIE) & (np.abs(b) <= radius + half_cell + TIE))
         in_rectangles |= (np.abs(a) <= half_width + TIE) & (np.abs(b) <= radius + TIE)
-    in_length, in_width = np.abs(v) <= robot.overall_length / 2.0 + TIE, np.abs(u) <= robot.overall_width / 2.0 + TIE
-    outline = in_length & in_width & ~in_rectangles
-    ground = [_bilinear(heights, place, cell_size) for place in _wheel_centres(robot, x, y, heading)]
+    in_length = np.abs(v) <= robot.overall_length / 2.0 + half_cell + TIE
+    outline = in_length & (np.abs(u) <= robot.overall_width / 2.0 + half_cell + TIE) & ~in_rectangles
+    under = [_bilinear(ground.filled, place, cell_size) for place in _wheel_centres(robot, x, y, heading)]
     touched = np.logical_or.reduce([outline, *on_tyres])
-    if np.isnan(z[touched]).any() or np.isnan(ground).any():
+    if np.isnan(z[touched]).any() or np.isnan(under).any():
         return UNKNOWN_POSE
 
-    resting, plane = ground, _least_squares_plane(ground, robot)
+    resting, plane = under, _least_squares_plane(under, robot)
     for _ in range(2):
         resting = [
             _resting_height(z[tyre], u[tyre] - right, v[tyre] - forward, plane[1:], radius, half_cell)
@@ -284,29 +294,46 @@ def _largest(values: np.ndarray, first_row: int, first_col: int) -> tuple[float,
 
 def step_heights(heights, radius: float, cell_size: float = 0.0625) -> np.ndarray:
     """Computes the step S [rows, cols] in metres at each node, for tyres of `radius` metres; NaN at unknown nodes."""
-    heights = closed(np.asarray(heights, dtype=np.float64), max(1, math.floor((radius + TIE) / cell_size)))
+    heights = filled(heights, radius, cell_size)
     steps = np.zeros_like(heights)
-    for row, col in DIRECTIONS:
-        length = cell_size * math.hypot(row, col)
-        for n in range(1, max(1, math.floor((radius + TIE) / length)) + 1):
-            behind, ahead = _shifted(heights, -n * row, -n * col), _shifted(heights, n * row, n * col)
-            rise = heights - behind
-            before = behind - _shifted(heights, -2 * n * row, -2 * n * col)
-            after = ahead - heights
-            steps = np.fmax(steps, rise - np.fmax(np.fmax(before, after), 0.0))  # fmax leaves out what is unknown
+    for direction in DIRECTIONS:
+        length = cell_size * math.hypot(*direction)
+        most = _nodes_within(radius, length)
+        z = {k: _shifted(heights, k * direction[0], k * direction[1]) for k in range(-2 * most, 2 * most + 1)}
+        for first in range(-most, 0):
+            for last in range(first + most + 1):
+                n = last - first
+                rise, before, after = z[last] - z[first], z[first] - z[first - n], z[last + n] - z[last]
+                gentle = rise - np.fmax(np.fmax(before, after), 0.0)  # fmax and fmin leave out what is unknown
+                steep = rise - np.fmax(np.fmin(before, after), n * length)
+                parts = [z[k + 1] - z[k] for k in range(first, last)]
+                belongs = np.all([parts[-first - 1] >= part for part in parts], axis=0)
+                steps = np.where(belongs, np.fmax(steps, np.fmax(gentle, steep)), steps)
     return np.where(np.isnan(heights), np.nan, steps)
 
 
-def closed(heights: np.ndarray, k: int) -> np.ndarray:
-    """Closes gaps: at a known node, the smallest of the largest heights in all squares of k x k nodes that contain it.
+def filled(heights, radius: float, cell_size: float = 0.0625) -> np.ndarray:
+    """Fills gaps that tyres of `radius` metres bridge: [rows, cols] metres, NaN at unknown nodes."""
+    heights = np.asarray(heights, dtype=np.float64)
+    result = heights.copy()
+    for direction in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        most = _nodes_within(radius, cell_size * math.hypot(*direction))
 
-    Squares may stand over the map's edge; nodes off the map and unknown ones do not count, and unknown ones stay so.
-    """
-    unknown = np.isnan(heights)
-    padded = np.pad(np.where(unknown, -math.inf, heights), k - 1, constant_values=-math.inf)
-    largest = np.lib.stride_tricks.sliding_window_view(padded, (k, k)).max(axis=(2, 3))
-    smallest = np.lib.stride_tricks.sliding_window_view(largest, (k, k)).min(axis=(2, 3))
-    return np.where(unknown, np.nan, smallest)
+        def rim(nodes: int, sign: int, direction=direction) -> np.ndarray:
+            """The rim `nodes` away on one side, as it goes on falling towards the middle."""
+            at, beyond = (
+                _shifted(heights, sign * k * direction[0], sign * k * direction[1]) for k in (nodes, nodes + 1)
+            )
+            return at + nodes * np.fmin(0.0, at - beyond)
+
+        for i in range(1, most):
+            for j in range(1, most - i + 1):
+                result = np.fmax(result, np.minimum(rim(i, -1), rim(j, 1)))
+    return np.where(np.isnan(heights), np.nan, result)
+
+
+def _nodes_within(radius: float, length: float) -> int:
+    return max(1, math.floor((radius + TIE) / length))
 
 
 def _shifted(heights: np.ndarray, rows: int, cols: int) -> np.ndarray:
