@@ -2,14 +2,15 @@
 
 Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
 
-Compiled code is kept in .pytest_cache for a week and shared by all processes: most of the tests' time is XLA's, and it
-compiles many programs several times. `make clean` removes it, `pytest --cache-clear` does without it.
+Compiled code is kept in a folder that is new for each session and shared by its processes: most of the tests' time is
+XLA's, and it compiles many programs several times.
 """
 
 import math
 import os
+import shutil
 import signal
-import time
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -52,19 +53,17 @@ def place_of(item) -> int:
     return LONGEST.index(file) if file in LONGEST else len(LONGEST)
 
 
-WEEK = 7 * 24 * 3600
-
-
 def pytest_configure(config):
     if not hasattr(config, "workerinput"):  # workers of pytest-xdist, and programs that tests start, inherit the folder
-        folder = config.cache.mkdir("compiled")
-        for path in folder.iterdir():
-            if path.stat().st_mtime < time.time() - WEEK:
-                path.unlink(missing_ok=True)
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="travjax-tests-")
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_unconfigure(config):
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 
 def pytest_collection_modifyitems(items):
