@@ -42,7 +42,9 @@ LONGEST = [
     *("commands/test_train.py", "simulation/test_traverse.py", "runs/test_predictor.py", "training/test_trainer.py"),
     *("commands/test_evaluate.py", "resnet/test_convolution.py", "test_jax_flags.py", "test_cli.py"),
     *("resnet/test_imagenet_weights.py", "terrain/test_styles.py", "experiments/test_transfer.py"),
-    *("resnet/test_network.py", "runs/test_checkpoint.py", "commands/test_dataset.py", "training/test_map_training.py"),
+    *("simulation/test_events.py", "models/test_input_images.py", "resnet/test_network.py", "runs/test_checkpoint.py"),
+    *("evaluation/test_map_figures.py", "commands/test_predict.py", "estimators/test_map_estimator.py"),
+    "test_docs.py",
 ]
 """Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
 

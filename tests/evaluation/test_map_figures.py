@@ -282,7 +282,20 @@ def test_all_of_the_papers_trajectories_are_drawn(tmp_path):
     figure = labelled(failed, np.ones((1, len(actions)), bool), actions=actions)
     assert colours(pixels(figure, tmp_path)) > 500
     assert sum(paths(event_axes(figure)[0]).values()) == 3042
-    assert figure.get_suptitle() == "3042 trajectories of Seekur Jr"
+    assert figure.get_suptitle() == "3042 trajectories of Seekur Jr, contact model nearest"
+
+
+def test_failing_paths_are_failed_from_the_pose_where_their_margin_is_reached():
+    failed = np.zeros((1, 36, 3), bool)
+    failed[0, 4, 1] = failed[0, 5, 1] = True
+    poses = np.zeros((1, 36, 3), int)
+    poses[0, 4, 1], poses[0, 5, 1] = 3, -2  # on an arc, and in a point turn
+    heights = np.zeros((1, *GRID.shape))
+    figure = map_figures.labelled_maps(heights, failed, np.ones((1, 36), bool), ["flat"], SETUP, poses)
+    last = event_axes(figure)[1].collections[-1]
+    assert to_hex(last.get_colors()[0]) == map_figures.FAILED
+    count = SETUP.actions.poses(0).shape[0]
+    assert [len(path.vertices) for path in last.get_paths()] == [count - 3, count]
 
 
 # ---- Predicted maps

@@ -10,8 +10,9 @@ from travjax.config import InputError, from_json, to_json
 from travjax.simulation.robot import Robot
 
 SEEKUR_JR = Robot.load("seekur_jr")
-LENGTHS = [field.name for field in fields(Robot) if field.name != "name" and "angle" not in field.metadata]
-NEEDED = [field.name for field in fields(Robot) if field.name != "max_roll"]
+NEEDED = [field.name for field in fields(Robot) if "optional" not in field.metadata]
+LENGTHS = [field.name for field in fields(Robot) if field.name in NEEDED[1:] and "angle" not in field.metadata]
+MAY_BE_LEFT_OUT = {field.name: None for field in fields(Robot) if "optional" in field.metadata}
 
 
 def as_toml(**changes) -> str:
@@ -33,6 +34,7 @@ def test_seekur_jr_has_the_numbers_of_the_specification():
         overall_width=0.835,
         ride_height=0.108,
         max_step=0.12,
+        nose_rise=0.10,
         max_tilt=math.radians(36.87),
     )
     assert expected == SEEKUR_JR
@@ -183,10 +185,24 @@ def test_a_bad_limit_of_roll_is_refused(value):
 
 
 def test_a_robot_without_a_limit_of_roll_is_saved_as_before_there_was_one():
-    assert list(to_json(SEEKUR_JR)) == NEEDED
-    robot = replace(SEEKUR_JR, max_roll=0.3)
-    assert to_json(robot) == to_json(SEEKUR_JR) | {"max_roll": 0.3}
+    plain = replace(SEEKUR_JR, **MAY_BE_LEFT_OUT)
+    assert list(to_json(plain)) == NEEDED
+    robot = replace(plain, max_roll=0.3)
+    assert to_json(robot) == to_json(plain) | {"max_roll": 0.3}
     assert from_json(to_json(robot), Robot) == robot and from_json(to_json(SEEKUR_JR), Robot) == SEEKUR_JR
+
+
+@pytest.mark.parametrize("field", ["overhang_height", "nose_rise"])
+def test_what_only_the_contact_model_tyre_uses_may_be_left_out_but_not_be_wrong(field):
+    assert getattr(replace(SEEKUR_JR, **{field: None}), field) is None
+    with pytest.raises(InputError, match=f"^{field} = -0.1: must be a length in metres from 0.001 to 100$"):
+        replace(SEEKUR_JR, **{field: -0.1})
+
+
+def test_a_robot_names_a_contact_model_or_none():
+    assert replace(SEEKUR_JR, contact="tyre") == SEEKUR_JR, "which model is used is part of a Setup"
+    with pytest.raises(InputError, match='^contact = \'wheel\': must be "nearest" or "tyre"$'):
+        replace(SEEKUR_JR, contact="wheel")
 
 
 def test_wheels_stand_front_left_front_right_rear_left_rear_right():

@@ -151,9 +151,11 @@ def test_a_step_of_everything_has_the_loss_and_statistics_of_a_forward_pass():
     samples = tuple(index[:8] for index in trainer_samples())
     made, optimizer = estimator(2), PRESET.training.make_optimizer(2, 1)
     settings = StepSettings(split_model(made)[0], PHASES[2], optimizer, PRESET.training.weight_decay)
-    weight = np.array([1, 1, 1, 1, 1, 1, 0, 0], np.float32)
-    batch = Batch((source(), *samples), failed_of(samples).astype(np.float32), weight)
-    moved, loss = update(state_of(made, 2, optimizer), batch, 11, 4, settings=settings)
+    weight, devices = np.array([1, 1, 1, 1, 1, 1, 0, 0], np.float32), Devices.all()
+    inputs = PHASES[2].place(devices.replicate(source()), samples, devices)  # as in training, whose code is compiled
+    batch = Batch(inputs, *devices.shard((failed_of(samples).astype(np.float32), weight)))
+    state = devices.replicate(state_of(made, 2, optimizer))
+    moved, loss = update(state, batch, 11, 4, settings=settings)
     key = jax.random.fold_in(jax.random.key(11), 4)
     logits, after = in_training(*split_model(made), images_of(samples), key)
     wanted = (entropy(logits, failed_of(samples)) * weight).sum() / 6

@@ -346,17 +346,24 @@ def test_margins_do_not_depend_on_the_position_in_the_batch(pool, chosen):
 
 
 @pytest.mark.parametrize(
-    "name", ["paper", "unpaired radii", "odd turns and unpaired radii", "fine large map", "coarse small map"]
+    ("name", "count"),
+    [
+        ("paper", 12),
+        ("unpaired radii", 7),
+        ("odd turns and unpaired radii", 7),
+        ("fine large map", 7),
+        ("coarse small map", 7),
+    ],
 )
-def test_a_map_has_the_same_bits_in_any_batch(name):
+def test_a_map_has_the_same_bits_in_any_batch(name, count):
     """Loops over few maps and views are compiled in other ways than those over many: these differed in 1e-8 m."""
     setup = SETUPS[name]
     robot, actions, grid = setup.robot, setup.actions, setup.grid
-    heights = generate_terrain([*STYLES, *STYLES, "rough", "smooth"], range(12), grid=grid)
+    heights = generate_terrain([*STYLES, *STYLES, "rough", "smooth"][:count], range(count), grid=grid)
     wanted = simulate(heights, robot, actions, grid=grid)
-    for count in (1, 2, 4, 7):
-        first = simulate(heights[:count], robot, actions, grid=grid)
-        assert_same(first, jax.tree.map(lambda margin: margin[:count], wanted), atol=0)  # noqa: B023
+    for fewer in (1, 2, 4, 7):
+        first = simulate(heights[:fewer], robot, actions, grid=grid)
+        assert_same(first, jax.tree.map(lambda margin: margin[:fewer], wanted), atol=0)  # noqa: B023
 
 
 @pytest.mark.parametrize("count", [1, 7])

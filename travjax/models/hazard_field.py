@@ -98,8 +98,10 @@ class UNet(nnx.Module):
         self.down = nnx.List([ConvNorm(upper, lower, 3, 2, config, rngs=rngs) for upper, lower in steps])
         self.up = nnx.List([ConvNorm(lower, upper, 1, 1, config, rngs=rngs) for upper, lower in steps])
         self.decoder = nnx.List([Block(upper, config, rngs=rngs) for upper, _ in steps])
-        self.fine = nnx.Param(_he_normal(rngs.params(), (3, 3, config.stem, learned), jnp.float32))
-        self.coarse = nnx.Param(_he_normal(rngs.params(), (1, 1, widths[0], 4 * learned), jnp.float32))
+        fine = _he_normal(rngs.params(), (9 * config.stem, learned), jnp.float32)  # a matrix compiles quickly
+        self.fine = nnx.Param(fine.reshape(3, 3, config.stem, learned))
+        coarse = _he_normal(rngs.params(), (widths[0], 4 * learned), jnp.float32)
+        self.coarse = nnx.Param(coarse.reshape(1, 1, widths[0], 4 * learned))
 
     def __call__(self, elevation: Float[Array, "b rows cols"], train: bool) -> Float[Array, "b rows cols c"]:
         """Returns the channels at all nodes.

@@ -12,7 +12,7 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 from flax import nnx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from travjax.config import require, require_number
 from travjax.resnet.convolution import batch_norm, convolve, max_pool
@@ -20,7 +20,15 @@ from travjax.resnet.convolution import batch_norm, convolve, max_pool
 EXPANSION = 4
 """Output channels of a bottleneck as a multiple of its inner channels."""
 
-_he_normal = nnx.initializers.variance_scaling(2.0, "fan_out", "normal")
+
+def _he_normal(key: Key[Array, ""], size: int, inputs: int, outputs: int) -> Float[Array, "size size in out"]:
+    """Draws a kernel from a normal distribution of variance 2 / (size^2 outputs), He et al. 2015, arXiv 1502.01852.
+
+    It is drawn as a matrix: XLA takes ten times as long to compile random numbers with several short axes.
+    """
+    deviation = jnp.sqrt(jnp.float32(2 / (size * size * outputs)))
+    kernel = jax.random.normal(key, (size * size * inputs, outputs), jnp.float32) * deviation
+    return kernel.reshape(size, size, inputs, outputs)
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,7 @@ class ConvNorm(nnx.Module):
     """
 
     def __init__(self, inputs: int, outputs: int, size: int, stride: int, config: NormConfig, *, rngs: nnx.Rngs):
-        self.kernel = nnx.Param(_he_normal(rngs.params(), (size, size, inputs, outputs), jnp.float32))
+        self.kernel = nnx.Param(_he_normal(rngs.params(), size, inputs, outputs))
         self.scale = nnx.Param(jnp.ones(outputs, jnp.float32))
         self.bias = nnx.Param(jnp.zeros(outputs, jnp.float32))
         self.mean = nnx.BatchStat(jnp.zeros(outputs, jnp.float32))

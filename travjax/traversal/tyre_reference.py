@@ -121,12 +121,14 @@ def simulate_trajectory(
 def turn_poses(actions, trajectory: int) -> np.ndarray:
     """Computes the poses [n, 3] of a trajectory's point turn: x = y = 0 metres, headings in radians, from 0 on.
 
-    The turn goes the shorter way round, anticlockwise where both are equal, in equal parts of at most 5 degrees.
+    The turn goes the shorter way round, anticlockwise where both are equal; its poses are those of the fewest equal
+    parts of 2 pi / turns that are at most 5 degrees each.
     """
-    start = poses(actions, trajectory)[0, 2]
-    turned = start if start <= math.pi + TIE else start - 2.0 * math.pi
-    parts = math.ceil(abs(turned) / TURN_PART - TIE)
-    headings = np.linspace(0.0, turned, parts + 1)
+    turn, one = trajectory // len(actions.radii) ** 2, 2.0 * math.pi / actions.turns
+    if 2 * turn > actions.turns:
+        turn -= actions.turns
+    parts = math.ceil(one / TURN_PART - TIE)
+    headings = one / parts * np.arange(abs(turn) * parts + 1) * np.sign(turn)
     return np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=1)
 
 
