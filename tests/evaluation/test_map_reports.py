@@ -35,6 +35,7 @@ def test_labels_are_written_with_all_that_they_depend_on(tmp_path, capsys):
         np.testing.assert_array_equal(labels["failed"], failures(margins, HUSKY))
         config = json.loads(str(labels["config"]))
     assert (config["world"], config["files"], config["robot"]["name"]) == (8.0, [], HUSKY.name)
+    with np.load(path) as labels:
         assert labels["where_pose"].shape == (2, len(FEW), 3) and labels["where_node"].shape == (2, len(FEW), 3, 2)
     assert config["contact"] == {"model": "nearest", "turn": False}
     shown = capsys.readouterr().out
