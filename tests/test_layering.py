@@ -23,10 +23,11 @@ LAYERS = {
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
+    "physics": "config model drive labelling check report",
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
-    "timing comparison",
-    "commands": "terrain label dataset weights train evaluate export predict bench",
+    "timing comparison physics",
+    "commands": "terrain label dataset weights train evaluate export predict physics bench",
     "program": "cli",
 }
 """Packages from the bottom to the top, those of TOP being travjax itself; in each, its modules likewise."""
@@ -34,7 +35,7 @@ LAYERS = {
 TOP = ("", "programs", "program")
 """Layers of modules that lie in no package."""
 
-MOST = 10
+MOST = 11
 """Modules in a package."""
 
 ORDER = [

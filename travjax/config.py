@@ -14,7 +14,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -96,21 +96,37 @@ def naming(what: object) -> Iterator[None]:
         raise
 
 
-def load_toml(path: str | Path, kind: type[Config]) -> Config:
-    """Reads one configuration dataclass from a TOML file.
+def load_toml(path: str | Path, kind: type[Config], others: Sequence[str] = ()) -> Config:
+    """Reads one configuration dataclass from a TOML file; others: names of tables in it that are not its own.
 
     Raises InputError that names the file when it is missing or not TOML, when a key is unknown or a field without a
     default is absent, and when the dataclass refuses a value.
     """
     path = Path(os.path.expanduser(path))
     table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
+    own = {key: value for key, value in table.items() if not (key in others and isinstance(value, dict))}
     older: Renamed = {}
     try:
-        made = _made(table, kind, older)
+        made = _made(own, kind, older)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     say_renamed(path, older)
     return made
+
+
+def load_table(path: str | Path, name: str, kind: type[Config]) -> Config | None:
+    """Reads a configuration dataclass from one table of a TOML file; None where the file has no such table.
+
+    Raises InputError as `load_toml` does.
+    """
+    path = Path(os.path.expanduser(path))
+    table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
+    if name not in table:
+        return None
+    try:
+        return _inner(name, table[name], kind, f"[{name}]", f"[{name}]", {})  # type: ignore[return-value]
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def say_renamed(where: object, older: Mapping[str, str]) -> None:

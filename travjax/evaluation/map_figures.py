@@ -222,6 +222,14 @@ def _draw_paths_from(ax, paths: np.ndarray, failed: np.ndarray, known: np.ndarra
     ax.add_collection(LineCollection(ends, colors=FAILED, linewidths=0.25, alpha=0.7))
 
 
+def draw_failures(ax, heights: np.ndarray, setup: Setup, trajectories: np.ndarray, failed: np.ndarray) -> None:
+    """Draws some trajectories on one map [rows, cols] in gray, coloured as safe or failed."""
+    _draw_elevation(ax, heights, setup.grid, *_colour_range(heights), colour="gray", alpha=0.35)
+    paths = setup.actions.poses(trajectories)[..., :2]
+    for colour, mask in ((SAFE, ~failed), (FAILED, failed)):
+        ax.add_collection(LineCollection(paths[mask], colors=colour, linewidths=0.8, alpha=0.9))
+
+
 def _draw_robot(ax, robot: Robot) -> None:
     """Draws chassis and wheels from above, to scale, facing +y."""
     for x, y in robot.wheel_positions():

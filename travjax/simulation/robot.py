@@ -10,6 +10,9 @@ from travjax.simulation.events import OPTIONAL, PAPER, Event
 
 PRESETS = Path(__file__).parent / "robots"
 
+OTHER_TABLES = ("physics",)
+"""Tables of a robot's file that are read elsewhere: labels do not depend on them."""
+
 LONGEST_NAME = 100
 """Characters that a robot's name may have at most."""
 
@@ -88,13 +91,18 @@ class Robot:
         """
         if isinstance(source, Robot):
             return source
+        return load_toml(Robot.path_of(source), Robot, OTHER_TABLES)
+
+    @staticmethod
+    def path_of(source: str | Path) -> Path:
+        """Returns the TOML file of a preset by name, or of a path itself; raises InputError for neither."""
         if Path(source).suffix.lower() == ".toml":
-            return load_toml(source, Robot)
+            return Path(source)
         if str(source) not in Robot.presets():
             raise InputError(
                 f"robot {str(source)!r}: no such preset; allowed: {', '.join(Robot.presets())}, or a .toml file"
             )
-        return load_toml(PRESETS / f"{source}.toml", Robot)
+        return PRESETS / f"{source}.toml"
 
     @staticmethod
     def presets() -> list[str]:

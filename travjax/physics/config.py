@@ -1,0 +1,66 @@
+"""What a physics engine needs to know of a robot beside its dimensions: the `[physics]` table of its file."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from travjax.config import InputError, load_table, require, require_number
+from travjax.simulation.robot import Robot
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """Mass, drive and tyres of a robot; kg, metres, newton metres, metres a second.
+
+    mass:           of robot and wheels, without payload
+    payload:        mass on top of it
+    centre_height:  height of the centre of mass above flat ground, with payload
+    drive_torque:   largest torque on the wheels of a side together
+    coupled:        whether the wheels of a side turn together (chain, belt or gears)
+    friction:       of the tyres on the ground
+    speed:          at which trajectories are driven
+    stiffness_time, stiffness_damping: time constant in seconds and damping ratio of a tyre's contact (MuJoCo's solref)
+    impedance:      smallest and largest impedance of a tyre's contact, its width in metres, midpoint and power (solimp)
+
+    Raises InputError (a ValueError) that names field, value and what is allowed.
+    """
+
+    mass: float
+    centre_height: float
+    drive_torque: float
+    payload: float = 0.0
+    coupled: bool = True
+    friction: float = 1.0
+    speed: float = 0.5
+    stiffness_time: float = 0.1
+    stiffness_damping: float = 0.5
+    impedance: tuple[float, float, float, float, float] = (0.3, 0.3, 0.001, 0.5, 2.0)
+
+    def __post_init__(self):
+        ranges = {
+            "mass": (0.1, 1e5),
+            "centre_height": (0.001, 10),
+            "drive_torque": (0.01, 1e6),
+            "payload": (-1e-9, 1e5),
+            "friction": (0.05, 5),
+            "speed": (0.05, 5),
+            "stiffness_time": (0.008, 1),
+            "stiffness_damping": (0.1, 10),
+        }
+        for name, (low, high) in ranges.items():
+            require_number(name, getattr(self, name), low, high, f"a number from {low:g} to {high:g}")
+        require(isinstance(self.coupled, bool), "coupled", self.coupled, "true or false")
+        numbers = isinstance(self.impedance, tuple) and len(self.impedance) == 5
+        require(numbers, "impedance", self.impedance, "five numbers, as MuJoCo's solimp")
+
+    @staticmethod
+    def load(robot: str | Path) -> "PhysicsConfig":
+        """Reads the `[physics]` table of a robot, given by its name or TOML file.
+
+        Raises InputError when there is no such robot, when its file has no such table, or when it is wrong.
+        """
+        path = Robot.path_of(robot)
+        found = load_table(path, "physics", PhysicsConfig)
+        if found is None:
+            needed = "mass, centre_height and drive_torque"
+            raise InputError(f"{path}: no table [physics]; needed: one with at least {needed} (see docs/physics.md)")
+        return found
