@@ -36,7 +36,7 @@ def drive_maps(
         found = label_physics(
             filled(batch["heights"]), wanted, setup, physics, folder / "driven", processes, on_progress=bar.update
         )
-    simulated = batch["failed"].any(axis=-1)[found.map, found.trajectory]
+    simulated = np.asarray(batch["failed"].any(axis=-1))[found.map, found.trajectory]
     saved = save_npz(
         folder / "labels_physics.npz",
         **vars(found),
