@@ -25,12 +25,13 @@ INK, PALE, SHADE = "#222222", "#8a8a8a", "#d9d9d9"
 
 PACKAGES = [
     {"commands": "parse, call the library, print", "experiments": "the paper's, and a comparison"},
-    {"training": "fitting: the trainer and its step; evaluation on test maps"},
+    {"training": "the trainer and its step; evaluation on test maps", "physics": "trajectories driven in MuJoCo"},
     {"runs": "a run on disk: checkpoints, model file, predictors"},
     {"estimators": "presets, samples, losses", "evaluation": "scores, tables, figures"},
     {"data": "windows of real sites, samples, splits, data sets"},
     {"point_clouds": "LAS, LAZ, PLY, PCD, text, meshes"},
     {"terrain": "synthetic ground", "rasters": "GeoTIFF and others", "models": "ResNet50, hazard field"},
+    {"traversal": "what happens to a robot on a map: the kernels of the contact models"},
     {"simulation": "grid, robot, actions, events", "resnet": "network, ImageNet weights"},
 ]
 """Packages and what each holds, in rows: each imports only from rows below its own."""

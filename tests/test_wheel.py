@@ -118,11 +118,12 @@ from pathlib import Path
 import travjax
 from travjax.config import load_toml
 from travjax.data.provenance import SitesConfig
+from travjax.experiments.physics import PhysicsExperiment
 from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
 from travjax.estimators.preset import Preset
 
-kinds = {{"sites": SitesConfig, "transfer": TransferConfig}}
+kinds = {{"physics": PhysicsExperiment, "sites": SitesConfig, "transfer": TransferConfig}}
 for kind, name in {names}:
     path = find_preset(name, kind)
     assert path.is_relative_to({str(installed.parent)!r}), path

@@ -105,8 +105,9 @@ def wheel_distances(robot: Robot, actions: ActionSpace, grid: Grid, trajectory: 
     return np.array([[distance(path(place, actions, trajectory), nodes, reach) for place in axle] for axle in places])
 
 
-def rendered(robot: Robot, actions: ActionSpace, grid: Grid, trajectory: int) -> np.ndarray:
+def rendered(setup: Setup, trajectory: int) -> np.ndarray:
     """Channels 2 and 3: [rows, cols, 2]."""
+    robot, actions, grid = setup.robot, setup.actions, setup.grid
     half_track = robot.track / 2
     centre = fading(distance(path(0, actions, trajectory), nodes_of(grid), half_track), half_track)
     front, rear = fading(wheel_distances(robot, actions, grid, trajectory), robot.wheel_width / 2).max(axis=1)

@@ -16,6 +16,7 @@ from travjax.models.trajectory_resnet import create
 from travjax.models.variables import split_model
 from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.run import Run, checked_meta, load_estimator
+from travjax.simulation.contact import Contact
 
 pytestmark = pytest.mark.usefixtures("shared_code")
 
@@ -34,7 +35,19 @@ def test_a_run_comes_back_as_it_was_saved(tmp_path):
     path = run_of().save(tmp_path)
     assert path == tmp_path / "run.json"
     assert Run.load(tmp_path) == run_of()
-    assert set(loads(path.read_text())) == {"preset", "robot", "actions", "grid"}  # the radii inf are texts
+    assert set(loads(path.read_text())) == {"preset", "robot", "actions", "grid", "contact"}  # the radii inf are texts
+
+
+def test_a_run_from_before_contact_models_is_the_papers(tmp_path):
+    path = run_of().save(tmp_path)
+    path.write_text(json.dumps({name: part for name, part in loads(path.read_text()).items() if name != "contact"}))
+    assert Run.load(tmp_path) == run_of() and run_of().setup.contact.model == "nearest"
+
+
+def test_a_run_of_another_contact_model_is_another_run():
+    other = replace(run_of(), setup=replace(run_of().setup, contact=Contact("tyre", True)))
+    with pytest.raises(InputError, match="contact.model = 'tyre': must be 'nearest', as in the run so far"):
+        run_of().require_same_settings(other, "--out")
 
 
 def test_the_run_of_the_command_is_the_preset(trained):
