@@ -49,7 +49,7 @@ SETTLE_TIME = 1.0
 
 
 @dataclass
-class _Watch:
+class Watch:
     """What the controller and the outcomes remember; copied where second arcs branch off."""
 
     integral: float = 0.0
@@ -86,7 +86,7 @@ class Driver:
             if not self.put_down(start, ground):
                 results |= {index: _outcome("bad_start", 0.0, 0.0) for index in indices}
                 continue
-            watch = _Watch()
+            watch = Watch()
             failed = self.follow(start, self.actions.radii[first], self.actions.arc_lengths[0], watch)
             if failed:
                 results |= {index: _outcome(failed, watch.station, watch.highest_tilt) for index in indices}
@@ -96,7 +96,7 @@ class Driver:
             for index, second in zip(indices, seconds, strict=True):
                 self.engine.mj_setState(self.world.model, self.data, state, self.spec)
                 self.engine.mj_forward(self.world.model, self.data)
-                own = _Watch(**(vars(watch) | {"station": 0.0, "progress_station": 0.0, "progress_time": 0.0}))
+                own = Watch(**(vars(watch) | {"station": 0.0, "progress_station": 0.0, "progress_time": 0.0}))
                 failed = self.follow(junction, self.actions.radii[second], self.actions.arc_lengths[1], own)
                 results[index] = _outcome(failed, self.actions.arc_lengths[0] + own.station, own.highest_tilt)
         return results
@@ -123,7 +123,7 @@ class Driver:
         moved = math.hypot(data.qpos[0] - x, data.qpos[1] - y)
         return bool(moved < OFF_PATH / 2 and self.tilt() < self.robot.max_tilt and forces < FORCE_TIME)
 
-    def follow(self, start: np.ndarray, radius: float, length: float, watch: _Watch) -> str:
+    def follow(self, start: np.ndarray, radius: float, length: float, watch: Watch) -> str:
         """Follows an arc from `start` to its end; returns the outcome that ends it, "" when it arrives."""
         model, data = self.world.model, self.data
         stations = np.arange(0.0, length + LOOK_AHEAD + 0.01, 0.01)
@@ -138,7 +138,7 @@ class Driver:
             self.engine.mj_step(model, data)
         return "stuck"
 
-    def watch_out(self, path: np.ndarray, stations: np.ndarray, length: float, watch: _Watch) -> str | None:
+    def watch_out(self, path: np.ndarray, stations: np.ndarray, length: float, watch: Watch) -> str | None:
         """Returns the outcome that ends an arc now, "" for its end, or None to go on."""
         span = CONTROL_STEPS * TIME_STEP
         position = self.data.qpos[:2]
@@ -165,7 +165,7 @@ class Driver:
             return "stuck"
         return "" if watch.station >= length - 0.005 else None
 
-    def steer(self, path: np.ndarray, stations: np.ndarray, watch: _Watch) -> None:
+    def steer(self, path: np.ndarray, stations: np.ndarray, watch: Watch) -> None:
         """Sets the speeds of the wheels towards a point ahead on the path."""
         ahead = path[min(int(np.searchsorted(stations, watch.station + LOOK_AHEAD)), len(path) - 1), :2]
         forward = self.axis(1)[:2]

@@ -51,7 +51,7 @@ NODES_AT_ONCE = 8
 
 @partial(jax.tree_util.register_dataclass, data_fields=["row", "col", "height"], meta_fields=[])
 @dataclass(frozen=True)
-class _Scan:
+class Scan:
     """Places in the order of a scan: [..., steps, N, places]."""
 
     row: jax.Array
@@ -73,8 +73,8 @@ class TyreChunks:
     axes: jax.Array
     corner: jax.Array
     within: jax.Array
-    tyres: _Scan
-    outline: _Scan
+    tyres: Scan
+    outline: Scan
 
 
 def tyre_chunks(table: TyreTable, chunks: int) -> TyreChunks:
@@ -83,8 +83,8 @@ def tyre_chunks(table: TyreTable, chunks: int) -> TyreChunks:
     def cut(array: np.ndarray) -> jax.Array:
         return jnp.asarray(array.reshape(chunks, -1, *array.shape[1:]))
 
-    def scan(places: Places) -> _Scan:
-        return _Scan(
+    def scan(places: Places) -> Scan:
+        return Scan(
             *(jnp.asarray(_scan_order(array.reshape(chunks, -1, array.shape[1]))) for array in vars(places).values())
         )
 
@@ -305,7 +305,7 @@ def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: 
     centre = jnp.repeat(chunk.centre, 4)
     east, north = (jnp.repeat(slope, 4, axis=0) for slope in (east, north))
 
-    def scan(largest, places: _Scan):
+    def scan(largest, places: Scan):
         above, reached, at = largest
         for k in range(places.row.shape[-1]):
             node, plane = _plane_at(centre, east, north, places, k, cols)
@@ -333,7 +333,7 @@ def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int, where:
     in the view [N, lanes]; no node unless `where`.
     """
 
-    def scan(best, places: _Scan):
+    def scan(best, places: Scan):
         highest, at = best
         for k in range(places.row.shape[-1]):
             node, plane = _plane_at(chunk.centre, east, north, places, k, cols)
@@ -346,7 +346,7 @@ def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int, where:
     return jax.lax.scan(scan, (jnp.full_like(level, -UNKNOWN_HEIGHT), nowhere), chunk.outline)[0]
 
 
-def _plane_at(centre, east, north, places: _Scan, k: int, cols: int) -> tuple[jax.Array, jax.Array]:
+def _plane_at(centre, east, north, places: Scan, k: int, cols: int) -> tuple[jax.Array, jax.Array]:
     """Returns the k-th node of every pose [N], and the height of the pose plane there above `centre` [N, lanes]."""
     row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
     plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
