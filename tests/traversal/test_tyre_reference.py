@@ -283,8 +283,18 @@ def test_a_drop_beside_the_tyre_is_no_step():
 @pytest.mark.parametrize("middle", [0.1, 0.4, 0.9])
 def test_a_blurred_kerb_keeps_its_height(spacing, middle):
     _, y = nodes(spacing)
-    blurred = 0.15 * np.where(y > 0.5 + 1e-6, 1.0, np.where(y > 0.5 - spacing + 1e-6, middle, 0.0))
-    assert tyre.step_heights(blurred, RADIUS, spacing).max() == pytest.approx(0.15)
+    blurred = 0.25 * np.where(y > 0.5 + 1e-6, 1.0, np.where(y > 0.5 - spacing + 1e-6, middle, 0.0))
+    assert tyre.step_heights(blurred, RADIUS, spacing).max() == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_a_short_face_of_forty_degrees_is_no_step(spacing):
+    """It is higher than the limit, but a wheel rolls up it; one of 50 degrees counts."""
+    _, y = nodes(spacing)
+    for degrees, most in ((40.0, 0.1), (50.0, None)):
+        face = np.clip(math.tan(math.radians(degrees)) * y, 0.0, 0.16)
+        step = tyre.step_heights(face, RADIUS, spacing).max()
+        assert step < most + 1e-9 if most else step > 0.1
 
 
 @pytest.mark.parametrize("depth", [0.2, 2.0, 5.0])

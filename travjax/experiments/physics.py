@@ -21,7 +21,7 @@ from travjax.data.sensor_noise import filled
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
-from travjax.files import find_data, find_preset, output_folder, save_text, user_path
+from travjax.files import find_data, find_preset, output_folder, save_npz, save_text, user_path
 from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import OUTCOMES, VERSION
 from travjax.physics.labelling import Variation, label_physics
@@ -93,16 +93,15 @@ def run(arguments: argparse.Namespace) -> None:
     heights, grounds = _maps(config)
     margins = {contact: _in_limits(heights, robot, contact) for contact in CONTACTS}
     known = np.logical_and.reduce([np.isfinite(one).all(axis=-1) for one in margins.values()])
-    sample = _sampled(margins["tyre"].max(axis=-1), known, config)
+    sample = _kept_sample(folder, margins["tyre"].max(axis=-1), known, config)
+    wanted = sample.wanted(len(heights))
     setup = Setup.chosen(robot, None, Setup(robot).grid)
     rng = np.random.default_rng(config.seed)
-    again = [np.sort(rng.permutation(one)[: round(config.repeats * len(one))]) for one in sample.wanted]
-    changes = [Variation(float(rng.uniform(0.95, 1.05)), float(rng.uniform(-0.02, 0.02))) for _ in sample.wanted]
-    total = sum(map(len, sample.wanted)) + sum(map(len, again))
+    again = [np.sort(rng.permutation(one)[: round(config.repeats * len(one))]) for one in wanted]
+    changes = [Variation(float(rng.uniform(0.95, 1.05)), float(rng.uniform(-0.02, 0.02))) for _ in wanted]
+    total = sum(map(len, wanted)) + sum(map(len, again))
     with progress.bar("driving", total, "trajectory") as bar:
-        first = label_physics(
-            heights, sample.wanted, setup, physics, folder / "driven", arguments.processes, None, bar.update
-        )
+        first = label_physics(heights, wanted, setup, physics, folder / "driven", arguments.processes, None, bar.update)
         second = label_physics(
             heights, again, setup, physics, folder / "again", arguments.processes, changes, bar.update
         )
@@ -132,30 +131,43 @@ def _in_limits(heights: np.ndarray, robot: Robot, contact: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Sample:
-    """Sampled trajectories of each map, and the weight of each stratum: how many trajectories one stands for."""
+    """Sampled trajectories: of which map, which, and how many trajectories each stands for; [k] sorted by map."""
 
-    wanted: list[np.ndarray]
-    weights: np.ndarray
+    map: np.ndarray
+    trajectory: np.ndarray
+    weight: np.ndarray
+
+    def wanted(self, maps: int) -> list[np.ndarray]:
+        """Returns the trajectories of each map."""
+        return [self.trajectory[self.map == index] for index in range(maps)]
 
 
 def _sampled(largest: np.ndarray, known: np.ndarray, config: PhysicsExperiment) -> _Sample:
     """Draws trajectories by their largest margin in limits [n, t]."""
     rng = np.random.default_rng(config.seed)
-    chosen, weights = np.zeros(largest.shape, bool), np.ones(len(STRATA))
-    for stratum, (low, high, share) in enumerate(STRATA):
+    weights = np.zeros(largest.shape)
+    for low, high, share in STRATA:
         candidates = np.flatnonzero((known & (largest >= low) & (largest < high)).ravel())
-        count = min(len(candidates), round(share * config.trajectories))
-        chosen.ravel()[rng.permutation(candidates)[:count]] = True
-        weights[stratum] = len(candidates) / max(count, 1)
-    return _Sample([np.flatnonzero(row) for row in chosen], weights)
+        chosen = rng.permutation(candidates)[: round(share * config.trajectories)]
+        weights.ravel()[chosen] = len(candidates) / max(len(chosen), 1)
+    which, trajectory = np.nonzero(weights)
+    return _Sample(which, trajectory, weights[which, trajectory])
+
+
+def _kept_sample(folder: Path, largest: np.ndarray, known: np.ndarray, config: PhysicsExperiment) -> _Sample:
+    """Returns the sample that the folder holds, so that an experiment goes on, or draws one and keeps it there."""
+    path = folder / "sampled.npz"
+    if not path.exists():
+        save_npz(path, **vars(_sampled(largest, known, config)))
+    with np.load(path) as kept:
+        return _Sample(kept["map"], kept["trajectory"], kept["weight"])
 
 
 def _report(folder, config, physics, grounds, margins, sample, first, second, setup, heights) -> None:
     started = first.started
     at = first.map[started], first.trajectory[started]
     failed = first.failed[started]
-    largest = margins["tyre"][at].max(axis=-1)
-    weights = sample.weights[np.searchsorted([high for _, high, _ in STRATA], largest, side="right")]
+    weights = sample.weight[started]
     rows, bands, alone = [], [], []
     for ground in (*dict.fromkeys(grounds.tolist()), "all"):
         here = np.ones(len(failed), bool) if ground == "all" else grounds[at[0]] == ground
@@ -195,8 +207,8 @@ def _report(folder, config, physics, grounds, margins, sample, first, second, se
         "outcomes": outcomes,
     }
     saved = save_text(folder / "results.json", json.dumps(results, indent=1) + "\n")
-    np.savez_compressed(
-        folder / "sample.npz",
+    driven = save_npz(
+        folder / "driven.npz",
         map=at[0],
         trajectory=at[1],
         failed=failed,
@@ -224,7 +236,7 @@ def _report(folder, config, physics, grounds, margins, sample, first, second, se
     ]
     report = launch.write_report(folder, f"Contact models against a physics engine, {setup.robot.name}", pieces)
     progress.say("\n" + table)
-    progress.wrote(saved, folder / "sample.npz", report)
+    progress.wrote(saved, driven, report)
 
 
 def _mean(values: np.ndarray, weights: np.ndarray) -> float | None:

@@ -72,10 +72,12 @@ def step_heights(filled: Float[Array, "n r c"], radius: float, spacing: float) -
             slope = jnp.nan_to_num(jnp.maximum(before, after))
             bank = jnp.maximum(jnp.nan_to_num(jnp.minimum(before, after)), n * distance)
             excess = rise - jnp.minimum(jnp.maximum(slope, 0), bank)
-            steepest = excess > highest
+            counts = excess > highest
+            if n > 1:
+                counts &= rise > n * distance  # what is less steep than 45 degrees is a slope
             for k in range(1 - i, j + 1):
-                steepest &= arriving >= at(k) - at(k - 1)
-            highest = jnp.where(steepest, excess, highest)
+                counts &= arriving >= at(k) - at(k - 1)
+            highest = jnp.where(counts, excess, highest)
     return highest
 
 

@@ -310,6 +310,8 @@ def step_heights(heights, radius: float, cell_size: float = 0.0625) -> np.ndarra
                 steep = rise - np.fmax(np.fmin(before, after), n * length)
                 parts = [z[k + 1] - z[k] for k in range(first, last)]
                 belongs = np.all([parts[-first - 1] >= part for part in parts], axis=0)
+                if n > 1:
+                    belongs &= rise > n * length
                 steps = np.where(belongs, np.fmax(steps, np.fmax(gentle, steep)), steps)
     return np.where(np.isnan(heights), np.nan, steps)
 
