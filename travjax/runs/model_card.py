@@ -81,6 +81,7 @@ def card(trained: Run, notes: dict, name: str, tables: str | None, real: str | N
 |---|---|
 | estimator | {preset.model}, {parameters:,} parameters |
 | robot | {trained.robot.name}; another one needs training: `travjax train PRESET --robot FILE` |
+| contact model | {trained.setup.contact.model}; what it predicts are failures of this one |
 | maps | {grid.size:g} x {grid.size:g} m at {grid.spacing:g} m, {len(trained.actions)} trajectories |
 | trained on | {data} (fingerprint {notes["dataset"]}), seed {preset.training.seed}, {notes["step"]:,} steps |
 {corrupted}
