@@ -199,6 +199,11 @@ def test_what_only_the_contact_model_tyre_uses_may_be_left_out_but_not_be_wrong(
         replace(SEEKUR_JR, **{field: -0.1})
 
 
+def test_a_nose_needs_a_robot_longer_than_its_wheelbase():
+    with pytest.raises(InputError, match="^nose_rise = 0.1: must be left out where overall_length is at most"):
+        replace(SEEKUR_JR, overall_length=SEEKUR_JR.wheelbase)
+
+
 def test_a_robot_names_a_contact_model_or_none():
     assert replace(SEEKUR_JR, contact="tyre") == SEEKUR_JR, "which model is used is part of a Setup"
     with pytest.raises(InputError, match='^contact = \'wheel\': must be "nearest" or "tyre"$'):

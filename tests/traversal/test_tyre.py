@@ -229,6 +229,16 @@ def test_what_is_beside_the_chassis_counts_with_its_own_height():
     assert obstacle[0] == pytest.approx(0.15, abs=1e-5) and obstacle[1] <= 0
 
 
+@pytest.mark.parametrize(
+    ("spacing", "height", "cells"), [(0.0625, 0.26, 2), (0.0625, 0.2, 2), (0.1, 0.28, 2), (0.04, 0.25, 3)]
+)
+def test_a_steep_face_of_a_few_cells_is_a_step_for_small_wheels(spacing, height, cells):
+    face = on(
+        lambda x, y: height * np.clip((y - 10 * spacing) / (cells * spacing), 0, 1), spacing, ONE_AHEAD, LEO_ROVER
+    )
+    assert float(face.step[0]) > LEO_ROVER.max_step
+
+
 # Point turns
 
 
@@ -259,6 +269,8 @@ def test_the_robots_file_decides_unless_an_argument_does():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"turn": "no"}, "turn = 'no': must be true or false"),
+        ({"contact": ""}, "contact = '': must be"),
         ({"contact": "wheel"}, 'contact = "?\'?wheel.*: must be "nearest" or "tyre"'),
         ({"robot": replace(SEEKUR_JR, overall_width=0.4)}, "overall_width = 0.4: must be at least chassis_width"),
         ({"actions": ActionSpace(arc_lengths=(1.65, 1.8))}, "outline leaves the map"),

@@ -29,6 +29,7 @@ class Contact:
     @staticmethod
     def from_model(model: str, turn: bool = True) -> "Contact":
         """Returns a contact model with its point turns, if it has any; turn=False leaves them out."""
+        require(isinstance(turn, bool), "turn", turn, "true or false")
         return Contact(model, turn and model != "nearest")
 
 

@@ -64,7 +64,7 @@ class Setup:
         """
         chosen = chosen_robot(robot)
         require(isinstance(actions, ActionSpace | None), "actions", actions, "a travjax.ActionSpace")
-        model = Contact.from_model(contact or chosen.contact or "nearest", turn)
+        model = Contact.from_model((chosen.contact or "nearest") if contact is None else contact, turn)
         return Setup(chosen, ActionSpace() if actions is None else actions, grid, model)
 
     @staticmethod

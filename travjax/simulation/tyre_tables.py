@@ -140,8 +140,10 @@ def _outline_surface(robot: Robot, grid: Grid) -> Surface:
         tyre = (np.abs(aside - robot.track / 2) <= half_width + TIE) & (
             np.abs(along - robot.wheelbase / 2) <= radius + TIE
         )
-        end = max(robot.overall_length - robot.wheelbase, TIE) / 2
-        rise = (robot.nose_rise or 0.0) * np.clip((along - robot.wheelbase / 2) / end, 0, 1)
+        rise = 0.0
+        if robot.nose_rise is not None:
+            end = (robot.overall_length - robot.wheelbase) / 2
+            rise = robot.nose_rise * np.clip((along - robot.wheelbase / 2) / end, 0, 1)
         return np.where(outline & ~tyre, np.where(chassis, 0.0, overhang) + rise, np.nan)
 
     return underside

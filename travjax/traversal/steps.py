@@ -20,6 +20,9 @@ TIE = 1e-9
 DIRECTIONS = tuple(direction for direction in product((-1, 0, 1), repeat=2) if any(direction))
 """The (row, col) offsets to the eight neighbours of a node; one of each opposite pair comes after the middle."""
 
+LEAST = 2
+"""Distances between nodes that a rise may take at least, also where a wheel is smaller: a sensor blurs a kerb so far."""
+
 At = Callable[[int], jax.Array]
 """Returns, for all nodes at once, the heights so many nodes further in one direction, NaN off the map."""
 
@@ -61,8 +64,9 @@ def step_heights(filled: Float[Array, "n r c"], radius: float, spacing: float) -
     Returns metres, at least 0; 0 where unknown. Source: SPEC section 15.
     """
     highest = jnp.zeros_like(filled)
-    for at, count, distance in _lines(filled, radius, spacing, DIRECTIONS, 2 * nodes_within(radius, spacing)):
-        arriving = at(0) - at(-1)
+    reach = 2 * max(LEAST, nodes_within(radius, spacing))
+    for at, within, distance in _lines(filled, radius, spacing, DIRECTIONS, reach):
+        count, arriving = max(LEAST, within), at(0) - at(-1)
         for i, j in product(range(1, count + 1), range(count)):
             n = i + j
             if n > count:

@@ -300,7 +300,7 @@ def step_heights(heights, radius: float, cell_size: float = 0.0625) -> np.ndarra
     steps = np.zeros_like(heights)
     for direction in DIRECTIONS:
         length = cell_size * math.hypot(*direction)
-        most = _nodes_within(radius, length)
+        most = max(2, _nodes_within(radius, length))
         z = {k: _shifted(heights, k * direction[0], k * direction[1]) for k in range(-2 * most, 2 * most + 1)}
         for first in range(-most, 0):
             for last in range(first + most + 1):
