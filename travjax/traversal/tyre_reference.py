@@ -309,7 +309,7 @@ def step_heights(heights, radius: float, cell_size: float = 0.0625) -> np.ndarra
                 gentle = rise - np.fmax(np.fmax(before, after), 0.0)  # fmax and fmin leave out what is unknown
                 steep = rise - np.fmax(np.fmin(before, after), n * length)
                 parts = [z[k + 1] - z[k] for k in range(first, last)]
-                belongs = np.all([parts[-first - 1] >= part for part in parts], axis=0)
+                belongs = np.all([parts[-first - 1] >= part - TIE for part in parts], axis=0)
                 steps = np.where(belongs, np.fmax(steps, np.fmax(gentle, steep)), steps)
     return np.where(np.isnan(heights), np.nan, steps)
 
