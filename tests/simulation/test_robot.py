@@ -123,7 +123,7 @@ def test_a_right_angle_is_the_largest_tilt():
 
 
 def test_a_millimetre_is_a_length():
-    small = dict.fromkeys(LENGTHS, 0.001) | {"track": 0.002}
+    small = dict.fromkeys(LENGTHS, 0.001) | {"track": 0.002, "nose_rise": None}
     assert replace(SEEKUR_JR, **small).wheelbase == 0.001
     assert replace(SEEKUR_JR, max_tilt=math.radians(0.01)).max_tilt == math.radians(0.01)
 

@@ -78,7 +78,7 @@ def test_parts_of_a_turn_are_equal_and_at_most_five_degrees():
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
-@pytest.mark.parametrize("degrees", [0.0, 10.0, 25.0, 40.0, 60.0])
+@pytest.mark.parametrize("degrees", [0.0, 25.0, 40.0, 50.0, 60.0])
 def test_planes_have_their_tilt_no_step_and_no_obstacle(spacing, degrees):
     for azimuth in np.radians([0.0, 33.0, 90.0, 135.0, 260.0]):
         heights = plane(spacing, degrees, azimuth)
@@ -258,25 +258,55 @@ def test_filling_gaps_leaves_planes_and_edges_as_they_are():
 
 @pytest.mark.parametrize("spacing", SPACINGS)
 @pytest.mark.parametrize(("slope", "height"), [(0.2, 0.15), (0.4, 0.2), (0.7, 0.25)])
-def test_a_kerb_whose_upper_side_is_downhill_loses_at_most_the_slope_of_a_cell(spacing, slope, height):
-    _, y = nodes(spacing)
-    step = inner(tyre.step_heights(kerb(spacing, height) - slope * y, RADIUS, spacing), spacing).max()
-    assert height - slope * spacing - 1e-9 <= step <= height
+@pytest.mark.parametrize("degrees", [0, 90, 180, 270])
+def test_a_kerb_whose_upper_side_is_downhill_loses_at_most_the_slope_of_a_cell(spacing, slope, height, degrees):
+    azimuth = math.radians(degrees)
+    heights = kerb(spacing, height, azimuth) + plane(spacing, -math.degrees(math.atan(slope)), azimuth)
+    step = inner(tyre.step_heights(heights, RADIUS, spacing), spacing).max()
+    assert height - slope * spacing - 1e-9 <= step <= height + 1e-9
+
+
+def bank(spacing, degrees, azimuth, foot, length=math.inf):
+    """Flat ground, and from `foot` metres on in the direction `azimuth` a bank, `length` metres long on the map."""
+    x, y = nodes(spacing, half=1.2)
+    along = x * math.cos(azimuth) + y * math.sin(azimuth) - foot
+    return math.tan(math.radians(degrees)) * np.clip(along, 0.0, length)
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
-@pytest.mark.parametrize("degrees", [62.0, 72.0, 75.0, 80.0, 85.0])
-@pytest.mark.parametrize("foot", [0.0, 0.2, 0.3])
-def test_a_steep_bank_under_the_right_wheels_is_never_safe(spacing, degrees, foot):
+@pytest.mark.parametrize("degrees", [62.0, 68.0, 75.0, 80.0])
+@pytest.mark.parametrize("azimuth", np.radians([0.0, 20.0, 45.0, 63.0]))
+def test_a_steep_bank_under_the_right_wheels_is_never_safe(spacing, degrees, azimuth):
+    """The robot drives along its foot or its crest, of which at most 0.03 m of the tyre's width is on the near side."""
+    for foot in (0.0, 0.1, 0.2, 0.24, 0.27):
+        for sign, length in ((1.0, math.inf), (1.0, 0.45), (-1.0, math.inf)):
+            ground = tyre.ground_of(sign * bank(spacing, degrees, azimuth, foot, length), ROBOT, spacing)
+            state = tyre.pose_state(ground, ROBOT, 0.0, 0.0, azimuth, spacing)
+            assert any(failures(tyre.TrajectoryMargins(state.step, state.clearance, state.tilt, known=True)))
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+def test_the_steps_of_a_steep_bank_lie_at_its_foot_and_do_not_depend_on_rounding(spacing):
+    """Each of its rises over N cells from the flat is N (tan - 1) d larger than one of 45 degrees."""
+    most = math.floor(RADIUS / spacing + 1e-9)
+    for foot in np.arange(0, 6) * spacing:
+        steps = tyre.step_heights(bank(spacing, 65.0, 0.0, foot), RADIUS, spacing)
+        first = steps.shape[1] // 2 + round(foot / spacing) + 1
+        expected = most * spacing * (math.tan(math.radians(65.0)) - 1.0)
+        np.testing.assert_allclose(steps[5:-5, first : first + most], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("spacing", SPACINGS)
+@pytest.mark.parametrize("blurred", [0.5, 0.3, 0.25])
+def test_a_drop_beside_the_tyre_is_no_step(spacing, blurred):
+    """The last node before the drop is the first one that the tyre does not reach, or the one before it."""
     x, _ = nodes(spacing)
-    bank = np.clip(math.tan(math.radians(degrees)) * (x - foot), 0.0, 1.5)
-    assert any(failures(simulated(bank, spacing=spacing)))
-
-
-def test_a_drop_beside_the_tyre_is_no_step():
-    x, _ = nodes(0.0625)
-    edge = ROBOT.track / 2.0 + ROBOT.wheel_width / 2.0 + 0.1
-    assert simulated(np.where(x > edge, -0.5, 0.0)).step == 0.0
+    edge = math.floor((ROBOT.track + ROBOT.wheel_width + spacing) / 2.0 / spacing + 1e-9) * spacing
+    for last, step in ((edge + spacing, 0.0), (edge, 0.5)):
+        drop = np.where(x > last + 1.5 * spacing, -0.5, np.where(x > last + 0.5 * spacing, -blurred, 0.0))
+        margins = simulated(drop, spacing=spacing)
+        assert margins.step == pytest.approx(step, abs=1e-9)
+        assert failures(margins) == [step > 0.0, False, False]
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -284,7 +314,9 @@ def test_a_drop_beside_the_tyre_is_no_step():
 def test_a_blurred_kerb_keeps_its_height(spacing, middle):
     _, y = nodes(spacing)
     blurred = 0.25 * np.where(y > 0.5 + 1e-6, 1.0, np.where(y > 0.5 - spacing + 1e-6, middle, 0.0))
-    assert tyre.step_heights(blurred, RADIUS, spacing).max() == pytest.approx(0.25)
+    for heights in (blurred, blurred.T, blurred[::-1], blurred.T[:, ::-1]):
+        assert tyre.step_heights(heights, RADIUS, spacing).max() == pytest.approx(0.25)
+    assert simulated(blurred, spacing=spacing).step == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)
@@ -297,10 +329,18 @@ def test_a_short_face_of_forty_degrees_is_no_step(spacing):
         assert step < most + 1e-9 if most else step > 0.1
 
 
+@pytest.mark.parametrize("spacing", SPACINGS)
 @pytest.mark.parametrize("depth", [0.2, 2.0, 5.0])
-def test_a_bridged_trench_under_the_wheels_does_not_bend_the_pose(depth):
-    x, _ = nodes(0.1)
-    assert simulated(np.where(np.abs(x - 0.3) < 0.05, -depth, 0.0), spacing=0.1).tilt < math.radians(1.0)
+def test_a_bridged_trench_under_the_wheels_does_not_bend_the_pose(spacing, depth):
+    """A tyre spans a trench along it; into one across it sinks between the rims as far as its roundness allows."""
+    x, y = nodes(spacing)
+    for k in range(math.ceil(0.2 / spacing), math.floor(0.45 / spacing) + 1, 2):
+        trench = np.where(np.abs(x - k * spacing) < spacing / 2.0, -depth, 0.0)
+        state = tyre.pose_state(tyre.ground_of(trench, ROBOT, spacing), ROBOT, 0.0, 0.0, 0.0, spacing)
+        assert (state.step, state.tilt) == (0.0, 0.0)
+    across = simulated(np.where(np.abs(y - spacing * 5) < spacing / 2.0, -depth, 0.0), spacing=spacing)
+    assert across.step == 0.0
+    assert across.tilt < math.radians(1.0)
 
 
 @pytest.mark.parametrize("spacing", SPACINGS)

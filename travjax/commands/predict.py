@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> None:
     model = predictor.run.preset.model
     require(arguments.model in (None, model), "--model", arguments.model, f"{model}, which the estimator is")
     robot = Robot.load(arguments.robot) if arguments.robot else None
-    predictor.require_trained_for(robot, contact=arguments.contact or (robot and robot.contact))
+    own = robot.contact if robot else None
+    predictor.require_trained_for(robot, contact=arguments.contact or own)
     maps = options.maps(arguments, predictor.run.grid)
     predict_maps(maps, predictor, arguments.out, arguments.check, figures=not arguments.no_figures)

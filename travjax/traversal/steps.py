@@ -20,8 +20,11 @@ TIE = 1e-9
 DIRECTIONS = tuple(direction for direction in product((-1, 0, 1), repeat=2) if any(direction))
 """The (row, col) offsets to the eight neighbours of a node; one of each opposite pair comes after the middle."""
 
+EVEN = 1e-5
+"""Metres, by which parts of a rise may differ and still be equal: rounding must not decide whose an even bank is."""
+
 LEAST = 2
-"""Distances between nodes that a rise may take at least, also where a wheel is smaller: a sensor blurs a kerb so far."""
+"""Distances between nodes that a rise may take, also where the wheel is smaller: a sensor blurs a kerb so far."""
 
 At = Callable[[int], jax.Array]
 """Returns, for all nodes at once, the heights so many nodes further in one direction, NaN off the map."""
@@ -80,7 +83,7 @@ def step_heights(filled: Float[Array, "n r c"], radius: float, spacing: float) -
             if n > 1:
                 counts &= rise > n * distance  # what is less steep than 45 degrees is a slope
             for k in range(1 - i, j + 1):
-                counts &= arriving >= at(k) - at(k - 1)
+                counts &= arriving >= at(k) - at(k - 1) - EVEN
             highest = jnp.where(counts, excess, highest)
     return highest
 

@@ -23,6 +23,7 @@ from travjax.traversal.reference import (
     window,
 )
 
+EVEN = 1e-5  # metres, by which parts of a rise may differ and still be equal
 TIE = 1e-9  # metres, and cells where a place is counted in cells
 TURN_PART = math.radians(5.0)  # the largest turn between two poses of a point turn
 DIRECTIONS = tuple((row, col) for row in (-1, 0, 1) for col in (-1, 0, 1) if row or col)
@@ -309,7 +310,7 @@ def step_heights(heights, radius: float, cell_size: float = 0.0625) -> np.ndarra
                 gentle = rise - np.fmax(np.fmax(before, after), 0.0)  # fmax and fmin leave out what is unknown
                 steep = rise - np.fmax(np.fmin(before, after), n * length)
                 parts = [z[k + 1] - z[k] for k in range(first, last)]
-                belongs = np.all([parts[-first - 1] >= part for part in parts], axis=0)
+                belongs = np.all([parts[-first - 1] >= part - EVEN for part in parts], axis=0)
                 if n > 1:
                     belongs &= rise > n * length
                 steps = np.where(belongs, np.fmax(steps, np.fmax(gentle, steep)), steps)
