@@ -123,7 +123,7 @@ def test_a_right_angle_is_the_largest_tilt():
 
 
 def test_a_millimetre_is_a_length():
-    small = dict.fromkeys(LENGTHS, 0.001) | {"track": 0.002, "nose_rise": None}
+    small = dict.fromkeys(LENGTHS, 0.001) | {"track": 0.002}
     assert replace(SEEKUR_JR, **small).wheelbase == 0.001
     assert replace(SEEKUR_JR, max_tilt=math.radians(0.01)).max_tilt == math.radians(0.01)
 
@@ -197,11 +197,6 @@ def test_what_only_the_contact_model_tyre_uses_may_be_left_out_but_not_be_wrong(
     assert getattr(replace(SEEKUR_JR, **{field: None}), field) is None
     with pytest.raises(InputError, match=f"^{field} = -0.1: must be a length in metres from 0.001 to 100$"):
         replace(SEEKUR_JR, **{field: -0.1})
-
-
-def test_a_nose_needs_a_robot_longer_than_its_wheelbase():
-    with pytest.raises(InputError, match="^nose_rise = 0.1: must be left out where overall_length is at most"):
-        replace(SEEKUR_JR, overall_length=SEEKUR_JR.wheelbase)
 
 
 def test_a_robot_names_a_contact_model_or_none():

@@ -272,6 +272,7 @@ def test_the_robots_file_decides_unless_an_argument_does():
         ({"turn": "no"}, "turn = 'no': must be true or false"),
         ({"contact": ""}, "contact = '': must be"),
         ({"contact": "wheel"}, 'contact = "?\'?wheel.*: must be "nearest" or "tyre"'),
+        ({"robot": replace(SEEKUR_JR, wheelbase=1.3)}, "nose_rise = 0.1: must be left out where overall_length is at"),
         ({"robot": replace(SEEKUR_JR, overall_width=0.4)}, "overall_width = 0.4: must be at least chassis_width"),
         ({"actions": ActionSpace(arc_lengths=(1.65, 1.8))}, "outline leaves the map"),
     ],

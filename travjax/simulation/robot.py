@@ -73,8 +73,6 @@ class Robot:
                 require_number(one.name, value, math.radians(0.0099), math.pi / 2, allowed)
             else:
                 require_length(one.name, value, 0.001, 100)
-        longer = self.nose_rise is None or self.overall_length > self.wheelbase
-        require(longer, "nose_rise", self.nose_rise, "left out where overall_length is at most the wheelbase")
         self._require_wheels_outside()
 
     def _require_wheels_outside(self) -> None:

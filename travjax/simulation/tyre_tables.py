@@ -92,12 +92,14 @@ def tyre_table(poses: np.ndarray, robot: Robot, grid: Grid) -> TyreTable:
 
 def require_inside(robot: Robot, poses: np.ndarray, grid: Grid) -> None:
     """Raises InputError when the overall outline, or a tyre, leaves the map at one of the poses [N, 3], or when the
-    outline does not contain the chassis.
+    outline does not contain the chassis, or has ends that rise but is no longer than the wheelbase.
     """
     for name in ("length", "width"):
         overall, chassis = getattr(robot, f"overall_{name}"), getattr(robot, f"chassis_{name}")
         allowed = f'at least chassis_{name} = {chassis:g} m for the contact model "tyre"'
         require(overall >= chassis - TIE, f"overall_{name}", overall, allowed)
+    longer = robot.nose_rise is None or robot.overall_length > robot.wheelbase
+    require(longer, "nose_rise", robot.nose_rise, "left out where overall_length is at most the wheelbase")
     half_width = max(robot.overall_width, robot.track + robot.wheel_width) / 2
     half_length = max(robot.overall_length, robot.wheelbase + robot.wheel_diameter) / 2
     x, y, heading = np.asarray(poses, float).T
