@@ -34,6 +34,13 @@ class Options(Protocol):
         """Adds an option."""
 
 
+def add_maps(parser: argparse.ArgumentParser) -> None:
+    """Adds the elevation map files of a command that takes synthetic maps without them; see `maps`."""
+    parser.add_argument(
+        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
+    )
+
+
 def add_synthetic(parser: argparse.ArgumentParser, count: int, each: str) -> None:
     """Adds the options for styles, number and seed of synthetic maps; see `maps`, `count` and `seed`."""
     parser.add_argument(

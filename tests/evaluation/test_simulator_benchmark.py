@@ -105,9 +105,9 @@ def test_the_sequential_simulator_goes_through_every_trajectory_of_one_map():
 
 def test_a_stream_labels_every_map_once_and_reports_its_progress(monkeypatch):
     monkeypatch.setattr(simulator_benchmark, "STREAM_CHUNK", 2)
-    stored, done, packed = [], [], simulator_benchmark.packed
+    stored, done, packed = [], [], simulator_benchmark.packed_labels
     monkeypatch.setattr(
-        simulator_benchmark, "packed", lambda *labels: stored.append(np.asarray(packed(*labels))) or stored[-1]
+        simulator_benchmark, "packed_labels", lambda *maps: stored.append(np.asarray(packed(*maps))) or stored[-1]
     )
     row = simulator_benchmark.stream_row(3, replace(SETUP, robot=FRAIL), done.append)
     assert is_whole(row)

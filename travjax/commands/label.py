@@ -4,7 +4,6 @@ import argparse
 
 from travjax import options
 from travjax.evaluation.map_reports import label_maps
-from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 
 
@@ -16,9 +15,7 @@ def add(commands: options.Commands) -> None:
         description="Labels every trajectory of maps with step, obstacle and tilt failures: of synthetic maps, or of "
         f"the windows of elevation maps: GeoTIFF and other rasters of local pixels that GDAL reads, {OTHERS}.",
     )
-    parser.add_argument(
-        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
-    )
+    options.add_maps(parser)
     options.add_synthetic(parser, count=200, each="maps in all, the styles in turn")
     options.add_dem(parser, stride=8.0)
     options.add_robot(parser)

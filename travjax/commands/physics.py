@@ -5,8 +5,6 @@ from dataclasses import asdict
 
 from travjax import options, progress
 from travjax.config import require
-from travjax.files import user_path
-from travjax.simulation.robot import Robot
 
 
 def add(commands: options.Commands) -> None:
@@ -17,9 +15,7 @@ def add(commands: options.Commands) -> None:
         description="Drives random trajectories of synthetic maps, or of the windows of elevation maps, in MuJoCo, and "
         "says how they fail: labels of a declared physics model, not ground truth. The robot's file needs [physics].",
     )
-    parser.add_argument(
-        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
-    )
+    options.add_maps(parser)
     options.add_synthetic(parser, count=5, each="maps in all, the styles in turn")
     options.add_dem(parser, stride=8.0)
     options.add_robot(parser)
@@ -43,9 +39,9 @@ def run(arguments: argparse.Namespace) -> None:
     require(arguments.trajectories > 0, "--trajectories", arguments.trajectories, "at least 1")
     physics = PhysicsConfig.load(arguments.robot)
     setup = options.setup(arguments)
-    checks = check(Robot.load(arguments.robot), physics)
+    checks = check(setup.robot, physics)
     rows = [asdict(one) | {"passed": "yes" if one.passed else "NO"} for one in checks]
-    progress.say(rows_table(rows, {name: name for name in ("what", "found", "wanted", "passed")}))
+    progress.say(rows_table(rows))
     if not passed(checks):
         progress.say("The model does not do what the data sheet says: nothing is driven.")
         raise SystemExit(1)

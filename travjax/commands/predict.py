@@ -19,9 +19,7 @@ def add(commands: options.Commands) -> None:
         "windows of elevation maps as `travjax label` takes them, or of synthetic maps. The estimator is the hazard "
         "field for the Seekur Jr that comes with the package, unless another is named.",
     )
-    parser.add_argument(
-        "dem", nargs="*", type=user_path, metavar="DEM", help="elevation map files; none: synthetic maps"
-    )
+    options.add_maps(parser)
     parser.add_argument(
         "--checkpoint",
         type=user_path,

@@ -31,13 +31,10 @@ from travjax.data.dataset_json import FORMAT, FORMAT_VERSION, digest, files_of, 
 from travjax.data.provenance import PROVENANCE_ARRAYS, SPLITS, Provenance
 from travjax.data.sampling import Samples, random_keys
 from travjax.files import atomic_write_folder, put_back, sha256, user_path
-from travjax.simulation.actions import ActionSpace
 from travjax.simulation.events import label_codes
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.setup import PARTS, Setup
+from travjax.simulation.setup import PARTS, Setup, WithSetup
 from travjax.terrain.styles import STYLES, generate_terrain, require_world
-from travjax.traversal.traverse import failures, margins_of, packed, unpacked
+from travjax.traversal.traverse import packed_labels, unpacked
 
 ARRAYS = ("heights", "labels", "group", "seed", "split")
 """Each array has its own file, `heights.npy` and so on; data sets of real maps also have PROVENANCE_ARRAYS."""
@@ -119,7 +116,7 @@ class DatasetConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class Dataset:
+class Dataset(WithSetup):
     """Maps, labels and splits; the arrays are on the host and must not be changed.
 
     heights: [n, rows, cols] float32 metres, NaN unknown
@@ -171,21 +168,6 @@ class Dataset:
         require(not unknown.size, "group", unknown[:1].tolist(), f"of {', '.join(groups or ())}")
 
     @property
-    def robot(self) -> Robot:
-        """The robot of the setup."""
-        return self.setup.robot
-
-    @property
-    def actions(self) -> ActionSpace:
-        """The action space of the setup."""
-        return self.setup.actions
-
-    @property
-    def grid(self) -> Grid:
-        """The grid of the setup."""
-        return self.setup.grid
-
-    @property
     def arrays(self) -> dict[str, np.ndarray]:
         """All arrays by name; those of the provenance come last."""
         return {name: getattr(self, name) for name in ARRAYS} | (self.provenance.arrays if self.provenance else {})
@@ -215,15 +197,14 @@ def generate(config: DatasetConfig, setup: Setup, on_progress: Progress | None =
     on_progress is called with the number of maps that were added. Needs memory for the arrays, 4.0 GB for the paper's
     56,840 maps, and a few hundred MB more. Raises InputError when robot, actions and grid do not fit together.
     """
-    setup.node_table()
+    setup.require_fit()
     styles, seeds = config.styles(), config.seeds()
     heights = np.empty((config.maps, *setup.grid.shape), np.float32)
     labels = np.empty((config.maps, len(setup.actions)), np.uint8)
     for start in range(0, config.maps, MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, config.maps))
         made = generate_terrain(styles[chunk].tolist(), seeds[chunk], grid=setup.grid, world=config.world)
-        margins = margins_of(made, setup)
-        labels[chunk] = packed(failures(margins, setup.robot), margins.known)
+        labels[chunk] = packed_labels(made, setup)
         heights[chunk] = made
         if on_progress:
             on_progress(chunk.stop - start)

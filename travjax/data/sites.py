@@ -31,7 +31,7 @@ from travjax.rasters.coordinates import is_local, places
 from travjax.simulation.events import UNKNOWN_LABEL
 from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
-from travjax.traversal.traverse import failures, margins_of, packed
+from travjax.traversal.traverse import packed_labels
 
 
 class Assignment(IntEnum):
@@ -59,7 +59,7 @@ def read(config: SitesConfig, setup: Setup, on_progress: Progress | None = None)
     not fit together, when a file is missing, cannot be read or is given twice, and when a site has no window left for a
     split that was asked for.
     """
-    setup.node_table()
+    setup.require_fit()
     grid = setup.grid
     found = [_windows(site, config, grid) for site in config.site]
     _require_different(found)
@@ -185,8 +185,7 @@ def _labels(heights: np.ndarray, setup: Setup, on_progress: Progress | None) -> 
     labels = np.empty((len(heights), len(setup.actions)), np.uint8)
     for start in range(0, len(heights), MAPS_AT_ONCE):
         chunk = slice(start, min(start + MAPS_AT_ONCE, len(heights)))
-        margins = margins_of(heights[chunk], setup)
-        labels[chunk] = packed(failures(margins, setup.robot), margins.known)
+        labels[chunk] = packed_labels(heights[chunk], setup)
         if on_progress:
             on_progress(chunk.stop - start)
     return labels

@@ -26,7 +26,7 @@ from travjax.files import atomic_write, output_folder
 from travjax.simulation.setup import Setup
 from travjax.terrain.styles import STYLES, generate_terrain
 from travjax.traversal import reference
-from travjax.traversal.traverse import failures, margins_of, packed
+from travjax.traversal.traverse import margins_of, packed_labels
 
 COLUMNS = {
     "what": "what",
@@ -143,8 +143,7 @@ def stream_row(maps: int, setup: Setup, on_progress: Callable[[int], object]) ->
     for first in range(0, maps, STREAM_CHUNK):
         count = min(STREAM_CHUNK, maps - first)
         heights = generate_terrain(*_mixture(first, count), grid=setup.grid)
-        margins = margins_of(heights, setup)
-        labels[first : first + count] = packed(failures(margins, setup.robot), margins.known)
+        labels[first : first + count] = packed_labels(heights, setup)
         on_progress(count)
     return _row("terrain and labelling, streamed", maps, time.perf_counter() - start, len(setup.actions), None, 1)
 

@@ -92,8 +92,13 @@ def where_table(poses: np.ndarray, failed: np.ndarray, setup: Setup) -> str:
     return _table(rows, ["", *ends])
 
 
-def rows_table(rows: Iterable[dict], columns: dict[str, str]) -> str:
-    """Tabulates dicts; `columns` maps keys to headings. None is left blank, numbers have four significant digits."""
+def rows_table(rows: Iterable[dict], columns: dict[str, str] | None = None) -> str:
+    """Tabulates dicts; `columns` maps keys to headings, and keys head themselves without it.
+
+    None is left blank, numbers have four significant digits.
+    """
+    rows = list(rows)
+    columns = {key: key for key in rows[0]} if columns is None else columns
     cells = [[_cell(row[key]) for key in columns] for row in rows]
     return _table(cells, list(columns.values()))
 

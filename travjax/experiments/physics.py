@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
         second = label_physics(
             heights, again, setup, physics, folder / "again", arguments.processes, changes, bar.update
         )
-    _report(folder, config, physics, grounds, margins, sample, first, second, setup, heights)
+    _report(folder, grounds, margins, sample, first, second, setup, heights)
 
 
 def _maps(config: PhysicsExperiment) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +163,7 @@ def _kept_sample(folder: Path, largest: np.ndarray, known: np.ndarray, config: P
         return _Sample(kept["map"], kept["trajectory"], kept["weight"])
 
 
-def _report(folder, config, physics, grounds, margins, sample, first, second, setup, heights) -> None:
+def _report(folder, grounds, margins, sample, first, second, setup, heights) -> None:
     started = first.started
     at = first.map[started], first.trajectory[started]
     failed = first.failed[started]
@@ -216,7 +216,7 @@ def _report(folder, config, physics, grounds, margins, sample, first, second, se
         outcome=first.outcome[started],
         **{contact: margins[contact][at] for contact in CONTACTS},
     )
-    table = rows_table(rows, {name: name for name in rows[0]})
+    table = rows_table(rows)
     pieces: list[launch.Piece] = [
         f"{len(first.map)} trajectories of {setup.robot.name} on {len(heights)} maps, driven in MuJoCo (controller and "
         f"thresholds version {VERSION}). Shares and scores are weighted by how the sample was drawn. {DESCRIPTION}",
@@ -224,13 +224,13 @@ def _report(folder, config, physics, grounds, margins, sample, first, second, se
         launch.verbatim(table),
         "*factor* is the factor on all limits that gives the best F1 on this very sample.",
         "## Share that fails, by the largest margin in limits",
-        launch.verbatim(rows_table(bands, {name: name for name in bands[0]})),
+        launch.verbatim(rows_table(bands)),
         "## Share that fails where one event alone exceeds its limit",
-        launch.verbatim(rows_table(alone, {name: name for name in alone[0]})),
+        launch.verbatim(rows_table(alone)),
         "## Outcomes, unweighted",
-        launch.verbatim(rows_table([outcomes], {name: name for name in outcomes})),
+        launch.verbatim(rows_table([outcomes])),
         "## Driven twice, with another friction (5 %) and start (2 cm)",
-        launch.verbatim(rows_table([noise], {name: name for name in noise})),
+        launch.verbatim(rows_table([noise])),
         map_figures.save(_bands_figure(bands), folder / "bands.png"),
         map_figures.save(_paths_figure(heights, first, setup, margins), folder / "paths.png"),
     ]
@@ -272,7 +272,7 @@ def _bands_figure(bands: list[dict]):
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     ax = figure.subplots()
     names = [name for name in bands[0] if name != "contact"]
-    for row, (colour, marker) in zip(bands, (("#9fd8fb", "o"), ("#7a1200", "s")), strict=True):
+    for row, (colour, marker) in zip(bands, ((map_figures.SAFE, "o"), (map_figures.FAILED, "s")), strict=True):
         ax.plot(names, [row[name] for name in names], color=colour, marker=marker, label=row["contact"])
     ax.axvline(names.index("1 to 1.4") - 0.5, color="gray", linestyle=":", label="limit")
     ax.set(xlabel="largest margin, in limits", ylabel="share that fails in physics", ylim=(0, 1))

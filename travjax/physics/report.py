@@ -63,7 +63,7 @@ def _table(groups: np.ndarray, found, simulated: np.ndarray, setup: Setup) -> st
             shares = {name or "arrived": f"{np.mean(found.outcome[here] == i):.1%}" for i, name in _names()}
             contact = f"{setup.contact.model}: fail"
             rows.append({"": group, "driven": int(here.sum())} | shares | {contact: f"{simulated[here].mean():.1%}"})
-    return rows_table(rows, {name: name for name in rows[0]})
+    return rows_table(rows)
 
 
 def _names() -> list[tuple[int, str]]:

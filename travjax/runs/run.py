@@ -23,10 +23,7 @@ from travjax.models.variables import VARIABLES, Network, merge_model, split_mode
 from travjax.resnet.imagenet_weights import Weights
 from travjax.resnet.weight_files import require_finite
 from travjax.runs.checkpoint import Checkpoints
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.grid import Grid
-from travjax.simulation.robot import Robot
-from travjax.simulation.setup import PARTS, Setup
+from travjax.simulation.setup import PARTS, Setup, WithSetup
 
 COUNTS, SUMS = ("phase", "epoch", "step", "total"), ("loss", "samples", "best")
 """Fields of the training position that a checkpoint records: whole numbers, and other numbers."""
@@ -36,7 +33,7 @@ DATA = "data"
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(WithSetup):
     """What a training run is made from.
 
     setup: robot, action space and grid that the labels, and so the network, are made for
@@ -44,21 +41,6 @@ class Run:
 
     preset: Preset
     setup: Setup
-
-    @property
-    def robot(self) -> Robot:
-        """The robot of the setup."""
-        return self.setup.robot
-
-    @property
-    def actions(self) -> ActionSpace:
-        """The action space of the setup."""
-        return self.setup.actions
-
-    @property
-    def grid(self) -> Grid:
-        """The grid of the setup."""
-        return self.setup.grid
 
     def save(self, folder: Path) -> Path:
         """Writes run.json."""

@@ -151,3 +151,24 @@ class Setup:
     def to_json_text(self, **more: Any) -> str:
         """Returns the setup and further values as JSON, with the version of travjax."""
         return json.dumps(self.to_json() | more | {"travjax": version("travjax")}, allow_nan=False)
+
+
+class WithSetup:
+    """What holds for one setup, and offers its parts by name."""
+
+    setup: Setup
+
+    @property
+    def robot(self) -> Robot:
+        """The robot of the setup."""
+        return self.setup.robot
+
+    @property
+    def actions(self) -> ActionSpace:
+        """The action space of the setup."""
+        return self.setup.actions
+
+    @property
+    def grid(self) -> Grid:
+        """The grid of the setup."""
+        return self.setup.grid

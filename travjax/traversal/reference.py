@@ -246,6 +246,11 @@ def simulate(
         results.append(simulate_trajectory(heights, robot, actions, int(trajectory), cell_size))
         if on_progress is not None:
             on_progress(len(results))
+    return collected(results)
+
+
+def collected(results: list[TrajectoryMargins]) -> Margins:
+    """Puts the margins of single trajectories into arrays."""
     return Margins(
         step=np.array([result.step for result in results], dtype=np.float64),
         obstacle=np.array([result.obstacle for result in results], dtype=np.float64),

@@ -111,6 +111,13 @@ def packed(failed: Bool[Array, "*n t k"], known: Bool[Array, "*n t"]) -> UInt8[A
 
 
 @usual_flags()
+def packed_labels(heights: Heights, setup: Setup) -> UInt8[Array, "*n t"]:
+    """Labels every trajectory of a setup on every map in a byte each; takes heights and raises as `simulate` does."""
+    margins = margins_of(heights, setup)
+    return packed(failures(margins, setup.robot), margins.known)
+
+
+@usual_flags()
 def unpacked(labels, robot: Robot | str | None = None) -> tuple[Bool[Array, "*n t k"], Bool[Array, "*n t"]]:
     """Unpacks labels that `packed` made for a robot, [n, t] uint8, into (failed, known)."""
     labels, count = jnp.asarray(labels), len(chosen_robot(robot).events)

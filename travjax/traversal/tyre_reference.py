@@ -19,6 +19,7 @@ from travjax.traversal.reference import (
     Margins,
     TrajectoryMargins,
     above_centre,
+    collected,
     poses,
     window,
 )
@@ -96,12 +97,7 @@ def simulate(
         results.append(_margins(ground, robot, actions, int(trajectory), cell_size, turn))
         if on_progress is not None:
             on_progress(len(results))
-    return Margins(
-        step=np.array([result.step for result in results], dtype=np.float64),
-        obstacle=np.array([result.obstacle for result in results], dtype=np.float64),
-        tilt=np.array([result.tilt for result in results], dtype=np.float64),
-        known=np.array([result.known for result in results], dtype=bool),
-    )
+    return collected(results)
 
 
 def simulate_trajectory(
