@@ -24,6 +24,31 @@ def work():
 raise SystemExit(entry.guarded(work))
 """
 
+DROPPED = """
+import os, signal, time
+from travjax import entry, signals
+class Closed:
+    def __del__(self):
+        os.kill(os.getpid(), NUMBER)
+        print("not here")
+def work():
+    Closed()  # Python drops what a destructor raises
+    time.sleep(100)
+raise SystemExit(entry.guarded(work))
+"""
+
+POSTPONED = """
+import os, signal
+from travjax import entry, signals
+def work():
+    with signals.postponed():
+        os.kill(os.getpid(), NUMBER)
+        print("done")
+        SECOND
+    print("not here")
+raise SystemExit(entry.guarded(work))
+"""
+
 IMPORTS = """
 import os, signal
 from travjax import signals
@@ -47,6 +72,21 @@ def test_work_is_cleaned_up_and_says_how_it_goes_on(tmp_path, number):
     code, line = ENDS[number]
     assert (done.returncode, done.stdout, done.stderr) == (code, "", f"{line}; it goes on\n")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_signal_that_comes_in_a_destructor_is_not_lost(tmp_path, number):
+    done = script(DROPPED, number, tmp_path)
+    code, line = ENDS[number]
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", f"{line}\n")
+
+
+@pytest.mark.parametrize("number", ENDS)
+@pytest.mark.parametrize("second", ["pass", "os.kill(os.getpid(), NUMBER); print('not here')"])
+def test_a_signal_waits_for_a_block_that_cannot_be_left_halfway_and_a_second_one_does_not(tmp_path, number, second):
+    done = script(POSTPONED.replace("SECOND", second), number, tmp_path)
+    code, line = ENDS[number]
+    assert (done.returncode, done.stdout, done.stderr) == (code, "done\n", f"{line}\n")
 
 
 @pytest.mark.parametrize("number", ENDS)

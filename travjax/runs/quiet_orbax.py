@@ -10,6 +10,8 @@ from typing import Any
 
 import uvloop
 
+from travjax.signals import postponed
+
 
 def _not_from_orbax(record: logging.LogRecord) -> bool:
     return "orbax" not in Path(record.pathname).parts
@@ -52,9 +54,12 @@ def patient_loops() -> Iterator[None]:
 
 @contextmanager
 def quiet_orbax() -> Iterator[Any]:
-    """Provides Orbax with patient loops, and without its warnings and its log, which repeats each error it raises."""
+    """Provides Orbax with patient loops, and without its warnings and its log, which repeats each error it raises.
+
+    A signal waits until Orbax is done.
+    """
     logging.getLogger("absl").addFilter(_not_from_orbax)  # adding it again changes nothing
-    with warnings.catch_warnings(), patient_loops():
+    with postponed(), warnings.catch_warnings(), patient_loops():
         warnings.simplefilter("ignore")
         from orbax.checkpoint import v1 as ocp
 
