@@ -23,7 +23,7 @@ LAYERS = {
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
-    "physics": "config model drive labelling check report",
+    "physics": "config model drive labelling agreement check report",
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
     "timing comparison physics",

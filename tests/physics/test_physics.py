@@ -9,8 +9,9 @@ import pytest
 from tests.commandline import run_words
 from travjax.config import InputError
 from travjax.experiments import physics as experiment
-from travjax.physics.check import check, passed
+from travjax.physics.check import check, passed, yaw_ratio
 from travjax.physics.config import PhysicsConfig
+from travjax.physics.drive import VERSION
 from travjax.physics.labelling import OUTCOMES, Variation, label_ground, label_physics
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -38,6 +39,12 @@ def test_the_seekur_jr_does_what_its_data_sheet_says():
 def test_a_weak_drive_does_not():
     checks = check(ROBOT, replace(PHYSICS, drive_torque=20.0))
     assert not passed(checks)
+
+
+def test_wheels_that_only_slip_sideways_turn_the_robot_as_far_as_coulomb_friction_says():
+    theory = 1 / (1 + (ROBOT.wheelbase / ROBOT.track) ** 2)  # point contacts, equal loads
+    assert yaw_ratio(ROBOT, PHYSICS, 2.5) == pytest.approx(theory, abs=0.15)
+    assert yaw_ratio(ROBOT, replace(PHYSICS, drive_torque=20.0), 2.5) < 0.2
 
 
 def test_grounds_that_decide_what_happens():
@@ -108,7 +115,7 @@ def test_the_command_writes_outcomes_table_and_picture(tmp_path):
     assert "rated" in out and "arrived" in out and (tmp_path / "driven.png").stat().st_size > 10_000
     with np.load(tmp_path / "labels_physics.npz") as labels:
         assert labels["outcome"].shape == labels["failed"].shape == (4,)
-        assert json.loads(str(labels["config"]))["version"] == 1
+        assert json.loads(str(labels["config"]))["version"] == VERSION
 
 
 def test_the_experiment_runs_and_goes_on(tmp_path):

@@ -9,12 +9,13 @@ from travjax.simulation.robot import Robot
 
 @dataclass(frozen=True)
 class PhysicsConfig:
-    """Mass, drive and tyres of a robot; kg, metres, newton metres, metres a second.
+    """Mass, drive and tyres of a robot; kg, metres, seconds, newton metres.
 
     mass:           of robot and wheels, without payload
     payload:        mass on top of it
     centre_height:  height of the centre of mass above flat ground, with payload
     drive_torque:   largest torque on the wheels of a side together
+    drive_inertia:  of a wheel with its share of motor and gears, as the wheel feels it, kg m^2
     coupled:        whether the wheels of a side turn together (chain, belt or gears)
     friction:       of the tyres on the ground
     speed:          at which trajectories are driven
@@ -27,11 +28,12 @@ class PhysicsConfig:
     mass: float
     centre_height: float
     drive_torque: float
+    drive_inertia: float
     payload: float = 0.0
     coupled: bool = True
     friction: float = 1.0
     speed: float = 0.5
-    stiffness_time: float = 0.1
+    stiffness_time: float = 0.05
     stiffness_damping: float = 0.5
     impedance: tuple[float, float, float, float, float] = (0.3, 0.3, 0.001, 0.5, 2.0)
 
@@ -40,6 +42,7 @@ class PhysicsConfig:
             "mass": (0.1, 1e5),
             "centre_height": (0.001, 10),
             "drive_torque": (0.01, 1e6),
+            "drive_inertia": (1e-6, 1e4),
             "payload": (-1e-9, 1e5),
             "friction": (0.05, 5),
             "speed": (0.05, 5),
@@ -61,6 +64,6 @@ class PhysicsConfig:
         path = Robot.path_of(robot)
         found = load_table(path, "physics", PhysicsConfig)
         if found is None:
-            needed = "mass, centre_height and drive_torque"
+            needed = "mass, centre_height, drive_torque and drive_inertia"
             raise InputError(f"{path}: no table [physics]; needed: one with at least {needed} (see docs/physics.md)")
         return found

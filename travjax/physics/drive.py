@@ -8,7 +8,7 @@ turns less than its wheels say.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from travjax.physics.model import TIME_STEP, World, mujoco
 from travjax.simulation.actions import ActionSpace, arc_poses
 from travjax.simulation.robot import Robot
 
-VERSION = 1
+VERSION = 2
 """Of controller and thresholds; it is written beside all labels."""
 
 OUTCOMES = ("stuck", "contact", "off_path", "tip", "tilt", "bad_start")
@@ -48,6 +48,19 @@ CONTROL_STEPS = 5
 SETTLE_TIME = 1.0
 
 
+class Drive(NamedTuple):
+    """What became of a trajectory.
+
+    outcome: one of OUTCOMES, "" when it arrived; station: metres driven; tilt: largest, radians
+    deviation: largest distance of the robot's centre from the path, metres
+    """
+
+    outcome: str
+    station: float = 0.0
+    tilt: float = 0.0
+    deviation: float = 0.0
+
+
 @dataclass
 class Watch:
     """What the controller and the outcomes remember; copied where second arcs branch off."""
@@ -59,6 +72,11 @@ class Watch:
     progress_station: float = 0.0
     progress_time: float = 0.0
     highest_tilt: float = 0.0
+    deviation: float = 0.0
+
+    def drive(self, outcome: str, before: float = 0.0) -> Drive:
+        """Returns the outcome of an arc that begins `before` metres from the trajectory's start."""
+        return Drive(outcome, before + self.station, self.highest_tilt, self.deviation)
 
 
 class Driver:
@@ -72,24 +90,24 @@ class Driver:
         self.spec = self.engine.mjtState.mjSTATE_INTEGRATION
         self.size = self.engine.mj_stateSize(world.model, self.spec)
 
-    def drive(self, trajectories: Mapping[tuple[int, int], Sequence[int]], ground) -> dict[int, dict[str, Any]]:
+    def drive(self, trajectories: Mapping[tuple[int, int], Sequence[int]], ground) -> dict[int, Drive]:
         """Drives second arcs after first arcs; returns outcomes by trajectory.
 
         trajectories: the second arcs to drive after each (turn, first arc)
         ground:       function of x and y arrays [m] that returns the ground's height, to put the robot down
         """
-        results: dict[int, dict[str, Any]] = {}
+        results: dict[int, Drive] = {}
         for (turn, first), seconds in trajectories.items():
             start = self.actions.first_poses(turn, first)[0]
             junction = self.actions.first_poses(turn, first)[-1]
             indices = [int(self.actions.index(turn, first, second)) for second in seconds]
             if not self.put_down(start, ground):
-                results |= {index: _outcome("bad_start", 0.0, 0.0) for index in indices}
+                results |= {index: Drive("bad_start") for index in indices}
                 continue
             watch = Watch()
             failed = self.follow(start, self.actions.radii[first], self.actions.arc_lengths[0], watch)
             if failed:
-                results |= {index: _outcome(failed, watch.station, watch.highest_tilt) for index in indices}
+                results |= {index: watch.drive(failed) for index in indices}
                 continue
             state = np.empty(self.size)
             self.engine.mj_getState(self.world.model, self.data, state, self.spec)
@@ -98,7 +116,7 @@ class Driver:
                 self.engine.mj_forward(self.world.model, self.data)
                 own = Watch(**(vars(watch) | {"station": 0.0, "progress_station": 0.0, "progress_time": 0.0}))
                 failed = self.follow(junction, self.actions.radii[second], self.actions.arc_lengths[1], own)
-                results[index] = _outcome(failed, self.actions.arc_lengths[0] + own.station, own.highest_tilt)
+                results[index] = own.drive(failed, self.actions.arc_lengths[0])
         return results
 
     def put_down(self, pose: np.ndarray, ground) -> bool:
@@ -146,7 +164,8 @@ class Driver:
         distance = np.where(near, np.hypot(*(path[:, :2] - position).T), np.inf)
         nearest = int(distance.argmin())
         watch.station = max(watch.station, float(stations[nearest]))
-        tilt = self.tilt()
+        tilt, away = self.tilt(), float(distance[nearest])
+        watch.deviation = max(watch.deviation, away)
         watch.highest_tilt = max(watch.highest_tilt, tilt)
         watch.tilt_time = watch.tilt_time + span if tilt > self.robot.max_tilt else 0.0
         watch.force_time = watch.force_time + span if self.body_force() > FORCE else 0.0
@@ -159,7 +178,7 @@ class Driver:
             return "tilt"
         if watch.force_time >= FORCE_TIME:
             return "contact"
-        if distance[nearest] > OFF_PATH:
+        if away > OFF_PATH:
             return "off_path"
         if watch.progress_time >= PROGRESS_TIME:
             return "stuck"
@@ -177,10 +196,22 @@ class Driver:
         lacks = wanted - float(self.data.qvel[5])  # the yaw rate in the body's frame
         watch.integral = float(np.clip(watch.integral + TURN_INTEGRAL * lacks * CONTROL_STEPS * TIME_STEP, -4, 4))
         turn = TURN_GAIN * wanted + watch.integral
-        difference = float(np.clip(turn * self.robot.track / 2, -2 * speed, 2 * speed))
-        radius = self.robot.wheel_diameter / 2
-        left_speed, right_speed = (speed - difference) / radius, (speed + difference) / radius
-        self.data.ctrl[:] = left_speed, right_speed, left_speed, right_speed
+        self.set_wheels(float(np.clip(turn * self.robot.track / 2, -2 * speed, 2 * speed)))
+
+    def set_wheels(self, difference: float) -> None:
+        """Sets the wheels' speeds: the robot's, with `difference` [m/s] more on the right and less on the left."""
+        radius, speed = self.robot.wheel_diameter / 2, self.physics.speed
+        left, right = (speed - difference) / radius, (speed + difference) / radius
+        self.data.ctrl[:] = left, right, left, right
+
+    def turn_wheels(self, yaw_rate: float, seconds: float) -> float:
+        """Lets the wheels turn as for a yaw rate without slip; returns the angle that the robot turns, in radians."""
+        self.set_wheels(yaw_rate * self.robot.track / 2)
+        turned = 0.0
+        for _ in range(round(seconds / TIME_STEP)):
+            self.engine.mj_step(self.world.model, self.data)
+            turned += float(self.data.qvel[5]) * TIME_STEP
+        return turned
 
     def axis(self, which: int) -> np.ndarray:
         """Returns an axis of the robot in the world: 0 right, 1 forward, 2 up."""
@@ -200,10 +231,6 @@ class Driver:
                 self.engine.mj_contactForce(self.world.model, data, number, force)
                 total += abs(float(force[0]))
         return total
-
-
-def _outcome(failed: str, station: float, tilt: float) -> dict[str, Any]:
-    return {"outcome": failed, "station": station, "tilt": tilt}
 
 
 def _quaternion(heading: float, pitch: float, roll: float) -> np.ndarray:

@@ -36,6 +36,7 @@ class Outcomes:
     map, trajectory: which they are
     outcome: index in ("", *OUTCOMES), 0 for those that arrived
     station: metres, how far each came; tilt: radians, how far it leaned
+    deviation: metres, how far its centre was from the path
     """
 
     map: Int[np.ndarray, " k"]
@@ -43,6 +44,7 @@ class Outcomes:
     outcome: Int[np.ndarray, " k"]
     station: Float[np.ndarray, " k"]
     tilt: Float[np.ndarray, " k"]
+    deviation: Float[np.ndarray, " k"]
 
     @property
     def started(self) -> np.ndarray:
@@ -90,10 +92,11 @@ def label_physics(
     ]
     paths = [folder / f"map_{index:05d}.json" for index in range(len(pieces))]
     folder.mkdir(parents=True, exist_ok=True)
+    driven: dict[int, list] = {}
     missing = []
     for index, (piece, path) in enumerate(zip(pieces, paths, strict=True)):
         if path.exists():
-            _require_same(path, key | piece.named())
+            driven[index] = _read(path, key | piece.named())
             on_progress(len(piece.trajectories))
         elif piece.trajectories:
             missing.append(index)
@@ -103,15 +106,10 @@ def label_physics(
             running = {pool.submit(_drive, pieces[index]): index for index in missing}
             for future in as_completed(running):
                 index = running[future]
-                save_text(paths[index], json.dumps(key | pieces[index].named() | {"outcomes": future.result()}))
+                driven[index] = future.result()
+                save_text(paths[index], json.dumps(key | pieces[index].named() | {"outcomes": driven[index]}))
                 on_progress(len(pieces[index].trajectories))
-    rows = [
-        (index, *row)
-        for index, path in enumerate(paths)
-        if pieces[index].trajectories
-        for row in json.loads(path.read_text())["outcomes"]
-    ]
-    return _outcomes(rows)
+    return _outcomes([(index, *row) for index in sorted(driven) for row in driven[index]])
 
 
 def label_ground(
@@ -128,8 +126,8 @@ def label_ground(
 
 
 def _outcomes(rows: list[tuple]) -> Outcomes:
-    columns = list(zip(*rows, strict=True)) or [()] * 5
-    kinds = (int, int, int, float, float)
+    columns = list(zip(*rows, strict=True)) or [()] * 6
+    kinds = (int, int, int, float, float, float)
     return Outcomes(*(np.array(column, kind) for column, kind in zip(columns, kinds, strict=True)))
 
 
@@ -149,7 +147,8 @@ class _Piece:
         return {"trajectories": self.trajectories, "variation": asdict(self.variation), "heights": round(checksum, 6)}
 
 
-def _require_same(path: Path, wanted: dict[str, Any]) -> None:
+def _read(path: Path, wanted: dict[str, Any]) -> list:
+    """Returns the outcomes in a file; raises InputError where it is damaged or of other settings."""
     try:
         saved = json.loads(path.read_text())
     except (OSError, ValueError) as error:
@@ -157,10 +156,11 @@ def _require_same(path: Path, wanted: dict[str, Any]) -> None:
     for name, value in wanted.items():
         same = json.loads(json.dumps(value)) == saved.get(name)
         require(same, f"{path}: {name}", "other", "as in this run; allowed: another folder")
+    return saved["outcomes"]
 
 
-def _drive(piece: _Piece) -> list[tuple[int, int, float, float]]:
-    """Drives the trajectories of one map: (trajectory, outcome, station, tilt) each."""
+def _drive(piece: _Piece) -> list[tuple[int, int, float, float, float]]:
+    """Drives the trajectories of one map: (trajectory, outcome, station, tilt, deviation) each."""
     setup, grid, actions = piece.setup, piece.setup.grid, piece.setup.actions
     heights = np.asarray(piece.heights, np.float64)
     physics = PhysicsConfig(**(vars(piece.physics) | {"friction": piece.physics.friction * piece.variation.friction}))
@@ -176,4 +176,4 @@ def _drive(piece: _Piece) -> list[tuple[int, int, float, float]]:
 
     results = Driver(world, setup.robot, physics, actions, piece.variation.aside).drive(groups, ground)
     names = (ARRIVED, *OUTCOMES)
-    return [(index, names.index(one["outcome"]), one["station"], one["tilt"]) for index, one in sorted(results.items())]
+    return [(index, names.index(one.outcome), *one[1:]) for index, one in sorted(results.items())]

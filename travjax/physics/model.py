@@ -22,6 +22,9 @@ TIME_STEP = 0.004
 BOXES = (3, 7)
 """Boxes of the body across and along."""
 
+SERVO_ERROR = 0.2
+"""Radians a second: a wheel that is so much too slow gets the whole torque."""
+
 BODY_HEIGHT = 0.2
 """Metres, of the boxes."""
 
@@ -74,7 +77,7 @@ def _xml(robot: Robot, physics: PhysicsConfig, rows: int, cols: int, half, low: 
     boxes = "".join(_box(robot, across, along) for across in range(BOXES[0]) for along in range(BOXES[1]))
     wheels = "".join(
         f'<body pos="{right} {forward} 0">'
-        f'<joint name="wheel{i}" type="hinge" axis="-1 0 0" armature="0.05" damping="0.1"/>'
+        f'<joint name="wheel{i}" type="hinge" axis="-1 0 0" armature="{physics.drive_inertia}" damping="0.1"/>'
         f'<geom type="ellipsoid" size="{robot.wheel_width / 2} {radius} {radius}" mass="{wheel_mass}" condim="3" '
         f'friction="{physics.friction} 0.005 0.0001" {soft} contype="1" conaffinity="2"/></body>'
         for i, (right, forward) in enumerate(robot.wheel_positions())
@@ -82,7 +85,7 @@ def _xml(robot: Robot, physics: PhysicsConfig, rows: int, cols: int, half, low: 
     torque = physics.drive_torque / 2
     # A servo of each wheel; those of a side are tied together where a chain does it.
     servos = "".join(
-        f'<velocity joint="wheel{i}" kv="{torque}" forcelimited="true" forcerange="{-torque} {torque}"/>'
+        f'<velocity joint="wheel{i}" kv="{torque / SERVO_ERROR}" forcelimited="true" forcerange="{-torque} {torque}"/>'
         for i in range(4)
     )
     ties = '<equality><joint joint1="wheel0" joint2="wheel2"/><joint joint1="wheel1" joint2="wheel3"/></equality>'
