@@ -80,9 +80,9 @@ class Windows:
         """Reads some of the windows, [k, rows, cols] as in `heights`; fastest in their own order."""
         corners = self._corners[which]
         cut = np.empty((len(corners), *self._grid.shape), np.float32)
-        with _naming(Path(self.path)):
+        with naming_file(Path(self.path)):
             for window, (surface, row, col) in zip(cut, corners.tolist(), strict=True):
-                window[...] = self._surfaces[surface].nodes(row, col, self._grid.nodes)
+                window[...] = self._surfaces[surface].nodes(*(slice(at, at + self._grid.nodes) for at in (row, col)))
         return cut
 
     def systems(self, which: slice | np.ndarray = slice(None)) -> np.ndarray:
@@ -138,8 +138,8 @@ def load_dem(
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
     require_grid(grid)
     options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)
-    with _naming(path):
-        rasters = _read(path, options, grid)
+    with naming_file(path):
+        rasters = read_rasters(path, options, grid)
         for raster in rasters:
             require_fine(raster.cell_size, allow_coarse)
             north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
@@ -147,7 +147,7 @@ def load_dem(
         corners, covered = _corners(rasters, stride, grid)
         surveys = [survey(raster.heights) for raster in rasters]
         require_known(sum(found.known for found in surveys))
-        offsets = _offsets(rasters, surveys)
+        offsets = height_offsets(rasters, surveys)
         base = [
             0.0 if raster.height_offset is not None else offset for raster, offset in zip(rasters, offsets, strict=True)
         ]
@@ -179,7 +179,7 @@ def load_dem(
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming_file(path: Path) -> Iterator[None]:
     """Prefixes errors about a file with its name."""
     try:
         yield
@@ -191,8 +191,8 @@ def _naming(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """Reads the rasters of a file according to its content."""
+def read_rasters(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
+    """Reads the rasters of a file according to its content; grid: smallest map, and cells of points."""
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
@@ -242,7 +242,7 @@ def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarr
     return np.concatenate(found), float(np.mean(covered))
 
 
-def _offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
+def height_offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
     """Returns the height offset of each raster in whole metres: the same for all unless they are FAR_APART."""
     if rasters[0].height_offset is not None:
         return [raster.height_offset or 0.0 for raster in rasters]

@@ -28,6 +28,7 @@ from travjax.simulation.heights import as_site
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.simulation.tyre_tables import tyre_table
+from travjax.site.ground import ArrayGround
 from travjax.site.primitives import Primitive, all_poses, straight_passes
 from travjax.traversal.arcs import UNKNOWN_HEIGHT, Shifted, arc_maxima, margins_from
 from travjax.traversal.nearest import NearestChunks, nearest_chunks, poses_on_nodes
@@ -147,13 +148,13 @@ def simulate_site(
     chosen = chosen_robot(robot)
     passes = straight_passes(stride=stride) if primitives is None else tuple(primitives)
     setup = SiteSetup(chosen, passes, spacing, stride, interval, contact or chosen.contact or "tyre")
-    ground = as_site(heights)
+    ground = ArrayGround(as_site(heights))
     lattice = setup.lattice(ground.shape)
     found = [np.full((len(passes), *lattice), np.nan, np.float32) for _ in chosen.events]
     known = np.zeros((len(passes), *lattice), bool)
     tiles = tiles_of(lattice)
     with ThreadPoolExecutor(workers()) as pool:
-        simulated = pool.map(lambda tile: tile_margins(cut(ground, tile, setup), setup), tiles)
+        simulated = pool.map(lambda tile: tile_margins(ground.part(*tile.ground(setup)), setup), tiles)
         for tile, margins in zip(tiles, simulated, strict=True):
             rows, cols = tile.within(lattice)
             own = slice(None), slice(rows.stop - rows.start), slice(cols.stop - cols.start)
@@ -161,22 +162,12 @@ def simulate_site(
                 field[:, rows, cols] = margins[name][own]
             known[:, rows, cols] = margins.known[own]
     step, obstacle, tilt, *optional = found
-    return Margins(step, obstacle, tilt, known, tuple(optional), chosen.event_names)
+    return Margins(step, obstacle, tilt, known, tuple(optional), chosen.event_names)  # type: ignore[arg-type]
 
 
 def workers() -> int:
     """Returns how many tiles are simulated side by side: one a core, since the kernel of a tile uses one."""
     return (os.cpu_count() or 1) if jax.default_backend() == "cpu" else 1
-
-
-def cut(heights: Float[np.ndarray, "rows cols"], tile: Tile, setup: SiteSetup) -> Float[np.ndarray, "n n"]:
-    """Cuts out the ground of a tile; NaN beyond the raster."""
-    wanted = tile.ground(setup)
-    ground = np.full([part.stop - part.start for part in wanted], np.nan, np.float32)
-    there = [slice(max(part.start, 0), min(part.stop, edge)) for part, edge in zip(wanted, heights.shape, strict=True)]
-    inside = [slice(a.start - b.start, a.stop - b.start) for a, b in zip(there, wanted, strict=True)]
-    ground[tuple(inside)] = heights[tuple(there)]
-    return ground
 
 
 @usual_flags()

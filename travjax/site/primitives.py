@@ -41,7 +41,8 @@ class Primitive:
         interval: metres between poses; each arc also has one at its end
         """
         start = np.array([math.sin(self.heading), -math.cos(self.heading), 0.0]) * self.behind
-        at, along = start + [0.0, 0.0, self.heading], []
+        at = start + [0.0, 0.0, self.heading]
+        along: list[np.ndarray] = []
         for radius, length in self.arcs:
             arc = arc_poses(at, np.asarray(radius), np.append(stations(length, interval), length))
             along.append(arc[1:] if along else arc)
