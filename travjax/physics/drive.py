@@ -17,7 +17,7 @@ from travjax.physics.model import TIME_STEP, World, mujoco
 from travjax.simulation.actions import ActionSpace, arc_poses
 from travjax.simulation.robot import Robot
 
-VERSION = 2
+VERSION = 3
 """Of controller and thresholds; it is written beside all labels."""
 
 OUTCOMES = ("stuck", "contact", "off_path", "tip", "tilt", "bad_start")
@@ -42,6 +42,9 @@ LOOK_AHEAD = 0.3
 TURN_GAIN, TURN_INTEGRAL = 2.0, 8.0
 """The wheels' difference in speed follows the yaw rate that is wanted, and what it lacks."""
 
+ACCELERATION = 0.5
+"""Metres a second squared: a robot that starts at once on a steep slope rears up."""
+
 CONTROL_STEPS = 5
 """Time steps between two decisions of the controller and looks at forces."""
 
@@ -65,6 +68,7 @@ class Drive(NamedTuple):
 class Watch:
     """What the controller and the outcomes remember; copied where second arcs branch off."""
 
+    speed: float = 0.0
     integral: float = 0.0
     force_time: float = 0.0
     tilt_time: float = 0.0
@@ -191,22 +195,23 @@ class Driver:
         forward = forward / max(math.hypot(*forward), 1e-9)
         to = ahead - self.data.qpos[:2]
         along, left = float(to @ forward), float(forward[0] * to[1] - forward[1] * to[0])
-        speed = self.physics.speed
+        span = CONTROL_STEPS * TIME_STEP
+        watch.speed = speed = min(self.physics.speed, watch.speed + ACCELERATION * span)
         wanted = speed * 2 * left / max(along**2 + left**2, 0.01)
         lacks = wanted - float(self.data.qvel[5])  # the yaw rate in the body's frame
-        watch.integral = float(np.clip(watch.integral + TURN_INTEGRAL * lacks * CONTROL_STEPS * TIME_STEP, -4, 4))
+        watch.integral = float(np.clip(watch.integral + TURN_INTEGRAL * lacks * span, -4, 4))
         turn = TURN_GAIN * wanted + watch.integral
-        self.set_wheels(float(np.clip(turn * self.robot.track / 2, -2 * speed, 2 * speed)))
+        self.set_wheels(speed, float(np.clip(turn * self.robot.track / 2, -2 * speed, 2 * speed)))
 
-    def set_wheels(self, difference: float) -> None:
-        """Sets the wheels' speeds: the robot's, with `difference` [m/s] more on the right and less on the left."""
-        radius, speed = self.robot.wheel_diameter / 2, self.physics.speed
+    def set_wheels(self, speed: float, difference: float) -> None:
+        """Sets the speeds of the wheels in m/s, `difference` more on the right and less on the left."""
+        radius = self.robot.wheel_diameter / 2
         left, right = (speed - difference) / radius, (speed + difference) / radius
         self.data.ctrl[:] = left, right, left, right
 
     def turn_wheels(self, yaw_rate: float, seconds: float) -> float:
-        """Lets the wheels turn as for a yaw rate without slip; returns the angle that the robot turns, in radians."""
-        self.set_wheels(yaw_rate * self.robot.track / 2)
+        """Lets the wheels turn at the speed as for a yaw rate without slip; returns the angle turned in radians."""
+        self.set_wheels(self.physics.speed, yaw_rate * self.robot.track / 2)
         turned = 0.0
         for _ in range(round(seconds / TIME_STEP)):
             self.engine.mj_step(self.world.model, self.data)

@@ -1,12 +1,13 @@
 """A robot on a map as a MuJoCo model.
 
 The ground is a height field. Wheels are ellipsoids with soft contacts: stiff ones chatter, and a skid-steer robot then
-hardly turns. The body is made of boxes whose ends are raised as the robot's file says. Robot and map share the frames
-of SPEC section 1: x right, y forward.
+hardly turns. The body is made of boxes, the chassis and what the overall outline has beyond it; its ends are raised as
+the robot's file says. Robot and map share the frames of SPEC section 1: x right, y forward.
 """
 
 import importlib.util
 from dataclasses import dataclass
+from itertools import pairwise, product
 from types import ModuleType
 from typing import Any
 
@@ -20,7 +21,10 @@ TIME_STEP = 0.004
 """Seconds."""
 
 BOXES = (3, 7)
-"""Boxes of the body across and along."""
+"""Boxes of the chassis across and along."""
+
+BOX = "box"
+"""What the names of the body's boxes begin with."""
 
 SERVO_ERROR = 0.2
 """Radians a second: a wheel that is so much too slow gets the whole torque."""
@@ -57,7 +61,7 @@ def build(heights: np.ndarray, spacing: float, robot: Robot, physics: PhysicsCon
     half = (cols - 1) * spacing / 2, (rows - 1) * spacing / 2
     model = engine.MjModel.from_xml_string(_xml(robot, physics, rows, cols, half, low, rise))
     model.hfield_data[:] = ((heights - low) / rise).astype(np.float32).ravel()
-    boxes = [engine.mj_name2id(model, engine.mjtObj.mjOBJ_GEOM, f"box{i}") for i in range(BOXES[0] * BOXES[1])]
+    boxes = [geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(BOX)]
     return World(model, frozenset(boxes))
 
 
@@ -74,7 +78,7 @@ def _xml(robot: Robot, physics: PhysicsConfig, rows: int, cols: int, half, low: 
     inertia = [body / 12 * (a * a + b * b) for a, b in ((length, height), (width, height), (width, length))]
     # Heights in the body's frame, whose origin lies at the height of the axles.
     centre = (physics.centre_height - radius) * total / body
-    boxes = "".join(_box(robot, across, along) for across in range(BOXES[0]) for along in range(BOXES[1]))
+    boxes = "".join(_body(robot))
     wheels = "".join(
         f'<body pos="{right} {forward} 0">'
         f'<joint name="wheel{i}" type="hinge" axis="-1 0 0" armature="{physics.drive_inertia}" damping="0.1"/>'
@@ -107,15 +111,34 @@ def _xml(robot: Robot, physics: PhysicsConfig, rows: int, cols: int, half, low: 
 </mujoco>"""
 
 
-def _box(robot: Robot, across: int, along: int) -> str:
-    """Returns one box of the body, above its part of the chassis."""
-    count_x, count_y = BOXES
-    half_x, half_y = robot.chassis_width / count_x / 2, robot.chassis_length / count_y / 2
-    x, y = (2 * across + 1 - count_x) * half_x, (2 * along + 1 - count_y) * half_y
+def _body(robot: Robot) -> list[str]:
+    """Returns the boxes of the body: of the chassis, and of what the overall outline has beyond it but the tyres."""
+    half_x, half_y = robot.chassis_width / 2, robot.chassis_length / 2
+    outer_x, outer_y = robot.overall_width / 2, robot.overall_length / 2
+    tyre_x, tyre_y = (robot.track + robot.wheel_width) / 2, (robot.wheelbase + robot.wheel_diameter) / 2
+    across, along = (np.linspace(-half, half, count + 1) for half, count in zip((half_x, half_y), BOXES, strict=True))
+    overhang = robot.ride_height if robot.overhang_height is None else robot.overhang_height
+    parts = [(x, y, robot.ride_height) for x, y in product(pairwise(across), pairwise(along))]
+    for sign in (-1, 1):
+        end, corner = (half_y, outer_y), (tyre_y, half_y)
+        parts += [
+            (x, (sign * y[0], sign * y[1]), overhang)
+            for x, y in (((-outer_x, outer_x), end), ((half_x, outer_x), corner), ((-outer_x, -half_x), corner))
+            if y[0] < y[1] and x[0] < x[1]
+        ]
+        if tyre_x < outer_x:
+            parts.append(((sign * tyre_x, sign * outer_x), (-half_y, half_y), overhang))
+    return [_box(robot, f"{BOX}{number}", *part) for number, part in enumerate(parts)]
+
+
+def _box(robot: Robot, name: str, x_edges, y_edges, underside: float) -> str:
+    """Returns one box of the body; underside: its height above flat ground, in metres, where the ends do not rise."""
+    x, y = sum(x_edges) / 2, sum(y_edges) / 2
+    half_x, half_y = abs(x_edges[1] - x_edges[0]) / 2, abs(y_edges[1] - y_edges[0]) / 2
     beyond = max(robot.overall_length - robot.wheelbase, 1e-9) / 2
     raised = (robot.nose_rise or 0.0) * float(np.clip((abs(y) - robot.wheelbase / 2) / beyond, 0, 1))
-    z = robot.ride_height - robot.wheel_diameter / 2 + raised + BODY_HEIGHT / 2
+    z = underside - robot.wheel_diameter / 2 + raised + BODY_HEIGHT / 2
     return (
-        f'<geom name="box{across * count_y + along}" type="box" size="{half_x} {half_y} {BODY_HEIGHT / 2}" '
+        f'<geom name="{name}" type="box" size="{half_x} {half_y} {BODY_HEIGHT / 2}" '
         f'pos="{x} {y} {z}" mass="0" condim="3" friction="0.5 0.005 0.0001" contype="1" conaffinity="2"/>'
     )
