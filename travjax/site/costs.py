@@ -14,7 +14,7 @@ IMPASSABLE, UNKNOWN_COST = 100, 255
 
 
 def band_names(robot: Robot) -> tuple[str, ...]:
-    """Returns the names of the bands in their order: the paper's events, what blocks, and the robot's further events."""
+    """Returns the names of the bands in order: counts, costs, the paper's events, what blocks, further events."""
     paper = robot.event_names[: len(PAPER)]
     counts = ("passable_headings", "known_headings", "cost_best", "cost_worst")
     return (*counts, *paper, "blocking_event", *robot.event_names[len(PAPER) :])
