@@ -13,7 +13,7 @@ LAYERS = {
     "simulation": "arrays grid heights events contact robot actions footprint tyre_tables setup",
     "traversal": "arcs nearest steps tyre tyre_trajectories traverse reference tyre_reference pose_by_pose",
     "terrain": "noise landforms rock_field styles",
-    "rasters": "coordinates reading_options formats raster gdal_files array_files holes surface",
+    "rasters": "coordinates reading_options formats raster gdal_files grid_maps array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "

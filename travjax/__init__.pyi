@@ -10,7 +10,7 @@ from .simulation.actions import ActionSpace
 from .simulation.events import EVENTS, Margins, Where
 from .simulation.grid import Grid
 from .simulation.robot import Robot
-from .site.ground import Site
+from .site.ground import SiteGround
 from .site.kernel import simulate_site
 from .site.mapping import SiteMap, map_site
 from .site.primitives import Primitive, straight_passes
@@ -32,7 +32,7 @@ __all__ = [
     "Predictor",
     "Primitive",
     "Robot",
-    "Site",
+    "SiteGround",
     "SiteMap",
     "TerrainParams",
     "Traverse",

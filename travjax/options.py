@@ -133,7 +133,7 @@ def add_run(parser: Options) -> None:
 
 DEM_OPTIONS = (
     *("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse"),
-    *("band", "classes", "up", "gdal_driver"),
+    *("band", "classes", "up", "gdal_driver", "topic", "layer", "time"),
 )
 """Names of the options that `add_dem` adds; each is None or False unless given."""
 
@@ -180,6 +180,11 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="NAME",
         help="a driver of GDAL that may read files beside those of local pixels; may be given again",
+    )
+    parser.add_argument("--topic", metavar="NAME", help="topic of a recorded GridMap (the only one)")
+    parser.add_argument("--layer", metavar="NAME", help="layer of a recorded GridMap (the only one)")
+    parser.add_argument(
+        "--time", type=float, metavar="S", help="read the latest GridMap until so many seconds from a recording's start"
     )
 
 
@@ -233,6 +238,9 @@ def reading(arguments: argparse.Namespace) -> DemOptions:
         arguments.classes,
         arguments.up,
         tuple(arguments.gdal_driver or ()),
+        arguments.topic,
+        arguments.layer,
+        arguments.time,
     )
 
 

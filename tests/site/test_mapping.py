@@ -12,7 +12,7 @@ from travjax.simulation.events import Margins
 from travjax.simulation.robot import Robot
 from travjax.site import kernel, mapping
 from travjax.site.costs import band_names, products
-from travjax.site.ground import Site
+from travjax.site.ground import SiteGround
 from travjax.site.kernel import simulate_site
 from travjax.site.mapping import map_site, save_map, setup_of
 from travjax.site.primitives import straight_passes
@@ -164,7 +164,7 @@ def test_everything_that_is_written_is_printed(mapped):
 
 def test_arrays_in_memory_are_the_same(mapped, site_file):
     out, _ = mapped
-    site = Site.open(site_file, fill_holes=False)
+    site = SiteGround.open(site_file, fill_holes=False)
     found = map_site(site, "leo_rover", headings=4)
     with rasterio.open(out / "map.tif") as file:
         for band, name in enumerate(file.descriptions, 1):
@@ -182,7 +182,7 @@ def test_xarray_gets_names_and_coordinates():
 
 def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_path, monkeypatch, mapped):
     monkeypatch.setattr(kernel, "TILE", 8)
-    site, setup = Site.open(site_file, fill_holes=False), setup_of("leo_rover", 4)
+    site, setup = SiteGround.open(site_file, fill_holes=False), setup_of("leo_rover", 4)
     simulated, parts_of = [], mapping.parts_of
 
     def stopping(ground, setup, done, after):
@@ -209,7 +209,7 @@ def test_what_is_unfinished_of_another_setup_is_not_used(site_file, tmp_path):
     (tmp_path / FOLDER).mkdir()
     (tmp_path / FOLDER / "settings.json").write_text("{}")
     np.save(tmp_path / FOLDER / "done.npy", np.ones(1, bool))
-    save_map(Site.open(site_file), setup_of("leo_rover", 2, contact="nearest"), tmp_path)
+    save_map(SiteGround.open(site_file), setup_of("leo_rover", 2, contact="nearest"), tmp_path)
     with rasterio.open(tmp_path / "headings.tif") as file:
         assert file.count == 2 and (file.read() != 255).any()
 

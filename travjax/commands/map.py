@@ -25,19 +25,22 @@ def add(commands: options.Commands) -> None:
         "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
     )
     options.add_reading(parser)
+    parser.add_argument(
+        "--grid-map", type=user_path, metavar="FILE", help="also write a GridMap of ROS 2 to this file, .mcap or .db3"
+    )
     options.add_out(parser, "runs/map")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Maps the site and writes the results."""
-    from travjax.site.ground import Site
+    from travjax.site.ground import SiteGround
     from travjax.site.mapping import coarse_note, save_map, setup_of
 
     passes = arguments.robot, arguments.headings, arguments.stride
     nodes = 0.0625 if arguments.spacing is None else arguments.spacing
     setup_of(*passes, nodes, arguments.contact)  # refuses what is wrong before the site is read
-    site = Site.open(
+    site = SiteGround.open(
         arguments.site,
         arguments.spacing,
         reading=options.reading(arguments),
@@ -48,4 +51,4 @@ def run(arguments: argparse.Namespace) -> None:
     for line in (*site.notes, coarse_note(site, setup.robot)):
         if line:
             progress.say(f"{arguments.site}: {line}")
-    save_map(site, setup, arguments.out)
+    save_map(site, setup, arguments.out, arguments.grid_map)

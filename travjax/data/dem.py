@@ -20,6 +20,7 @@ from travjax.point_clouds.clouds import cloud_of_arrays, read_cloud
 from travjax.rasters.array_files import rasters_of, read_npy, read_npz
 from travjax.rasters.formats import unfolded
 from travjax.rasters.gdal_files import read_raster
+from travjax.rasters.grid_maps import read_grid_map
 from travjax.rasters.raster import Raster, Survey, require_fine, require_known, require_size, survey
 from travjax.rasters.reading_options import DemOptions
 from travjax.rasters.surface import Surface
@@ -109,6 +110,9 @@ def load_dem(
     classes: tuple[int, ...] | None = None,
     up: str | None = None,
     gdal_drivers: tuple[str, ...] = (),
+    topic: str | None = None,
+    layer: str | None = None,
+    time: float | None = None,
 ) -> Windows:
     """Cuts a DEM into windows of the grid's size, starting at its south-west corner; partial windows are dropped.
 
@@ -129,6 +133,8 @@ def load_dem(
     classes:      classes of LAS points to use; unless given, ground only, if the file has classified ground
     up:           "y" if that axis of a point cloud or mesh points up; "z" unless given
     gdal_drivers: GDAL drivers that may read the file besides those in gdal_files.DRIVERS
+    topic, layer: of a recording of ROS with a GridMap (.bag, .db3, .mcap); the only ones unless given
+    time:         seconds from the start of a recording, until which the latest map is read; its end unless given
     Raises InputError when the file is missing, is not an elevation map, is in degrees, feet or a system whose units are
     not metres on the ground, has no cell size, a non-square or too large one, or one that differs from the given, has
     infinite or absurd heights or no known ones, is smaller than one window, or does not fit into memory.
@@ -137,7 +143,7 @@ def load_dem(
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
     require_grid(grid)
-    options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)
+    options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers, topic, layer, time)
     with naming_file(path):
         rasters = read_rasters(path, options, grid)
         for raster in rasters:
@@ -202,6 +208,8 @@ def read_rasters(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
             rasters = read_npy(readable, options)
         elif form == "npz":
             rasters = _read_archive(readable, options, grid)
+        elif form == "recording":
+            rasters = [read_grid_map(readable, options)]
         elif form == "raster":
             rasters = [read_raster(readable, options)]
         else:

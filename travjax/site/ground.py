@@ -51,7 +51,7 @@ class ArrayGround:
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class SiteGround:
     """An elevation map of a site in a file.
 
     spacing:       metres between nodes; origin: x, y of the south-west node
@@ -79,7 +79,7 @@ class Site:
         reading: DemOptions = DemOptions(),
         fill_holes: bool = True,
         allow_coarse: bool = False,
-    ) -> "Site":
+    ) -> "SiteGround":
         """Opens the elevation map of a site, whatever `load_dem` reads, as one raster.
 
         spacing: metres between nodes; 0.0625 unless given, or the file's cells where these are coarse and allowed
@@ -103,7 +103,7 @@ class Site:
             above = 0.0 if raster.height_offset is not None else offset
             surface = Surface(raster, nodes, above, fill_holes and raster.height_offset is None)
             checksum = sha256(path)
-        return Site(
+        return SiteGround(
             nodes, raster.origin, raster.crs, raster.cell_size, offset, str(path), checksum, raster.notes, surface
         )
 

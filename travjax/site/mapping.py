@@ -8,17 +8,19 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from travjax import progress
-from travjax.config import require_length, to_json
+from travjax.config import require, require_length, to_json
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
-from travjax.files import held, output_folder, save_text
+from travjax.files import atomic_write, held, output_folder, save_text
+from travjax.memory import require_memory
+from travjax.rasters.grid_maps import rosbags, write_grid_map
 from travjax.simulation.heights import as_site
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.site import site_figures
 from travjax.site.costs import UNKNOWN_COST, band_names
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
-from travjax.site.ground import ArrayGround, Site
+from travjax.site.ground import ArrayGround, SiteGround
 from travjax.site.kernel import SiteSetup, tiles_of
 from travjax.site.nav2 import save_nav2
 from travjax.site.primitives import straight_passes
@@ -81,7 +83,7 @@ def setup_of(
 
 
 def map_site(
-    site: str | Path | Site | Float[np.ndarray, "rows cols"],
+    site: str | Path | SiteGround | Float[np.ndarray, "rows cols"],
     robot: Robot | str | None = None,
     *,
     headings: int = 16,
@@ -91,19 +93,19 @@ def map_site(
 ) -> SiteMap:
     """Maps where a robot can drive on a whole site, and in which direction.
 
-    site:     an elevation map that `load_dem` reads, a `Site`, or heights [rows, cols] in metres, row 0 in the south
+    site:     an elevation map that `load_dem` reads, a `SiteGround`, or heights [rows, cols] in metres, row 0 south
     robot:    a Robot, or the name or file of one; the Seekur Jr unless given
     headings: number of headings, evenly around the circle; stride: metres between places (0.25); spacing: metres
               between nodes (0.0625)
     contact:  contact model, "tyre" or "nearest"; that of the robot's file unless given, or else "tyre"
-    Source: SPEC section 13. Raises InputError as `Site.open` and `simulate_site` do.
+    Source: SPEC section 13. Raises InputError as `SiteGround.open` and `simulate_site` do.
     """
-    ground: Site | ArrayGround
+    ground: SiteGround | ArrayGround
     if isinstance(site, str | Path):
-        ground = Site.open(site, spacing)
+        ground = SiteGround.open(site, spacing)
     else:
-        ground = site if isinstance(site, Site) else ArrayGround(as_site(site))
-    nodes = ground.spacing if isinstance(ground, Site) else 0.0625 if spacing is None else spacing
+        ground = site if isinstance(site, SiteGround) else ArrayGround(as_site(site))
+    nodes = ground.spacing if isinstance(ground, SiteGround) else 0.0625 if spacing is None else spacing
     setup = setup_of(robot, headings, stride, nodes, contact)
     names, lattice = band_names(setup.robot), setup.lattice(ground.shape)
     bands = np.full((len(names), *lattice), np.nan, np.float32)
@@ -112,30 +114,36 @@ def map_site(
     for _, part in parts_of(ground, setup):
         place = ..., *part.tile.within(lattice)
         bands[place], costs[place], heights[place] = part.bands, part.costs, part.heights
-    origin = ground.origin if isinstance(ground, Site) else (0.0, 0.0)
+    origin = ground.origin if isinstance(ground, SiteGround) else (0.0, 0.0)
     x, y = (start + setup.stride * np.arange(count) for start, count in zip(origin, lattice[::-1], strict=True))
     angles = 2 * np.pi * np.arange(headings) / headings
-    crs = ground.crs if isinstance(ground, Site) else None
+    crs = ground.crs if isinstance(ground, SiteGround) else None
     return SiteMap(dict(zip(names, bands, strict=True)), costs, heights, angles, x, y, crs)
 
 
-def save_map(site: Site, setup: SiteSetup, out: str | Path) -> Path:
+def save_map(site: SiteGround, setup: SiteSetup, out: str | Path, grid_map: Path | None = None) -> Path:
     """Maps a site and writes map.tif, headings.tif, the maps for Nav2, figures and shares; returns the folder.
 
     Memory does not grow with the site; a run that was stopped goes on with the tiles that are missing.
-    Raises InputError when rasterio is missing, or when something cannot be read or written.
+    grid_map: file of ROS 2, .mcap or .db3, that gets the bands and the elevation as layers of a GridMap
+    Raises InputError when rasterio is missing, or rosbags for a GridMap, or when something cannot be read or written.
     """
     rasterio()
+    if grid_map is not None:
+        rosbags()
+        require(grid_map.suffix in (".mcap", ".db3"), "--grid-map", str(grid_map), "a name that ends in .mcap or .db3")
     folder = output_folder(out)
     with held(folder):
         store = _simulated(site, setup, folder)
         written = _written(store, site, setup, folder)
+        if grid_map is not None:
+            written.append(_save_grid_map(grid_map, store, site, setup))
         store.remove()
     progress.wrote(*written)
     return folder
 
 
-def _simulated(site: Site, setup: SiteSetup, folder: Path) -> Store:
+def _simulated(site: SiteGround, setup: SiteSetup, folder: Path) -> Store:
     lattice, names = setup.lattice(site.shape), band_names(setup.robot)
     tiles = tiles_of(lattice)
     settings = {"site": site.sha256, "setup": to_json(setup), "lattice": lattice}
@@ -147,7 +155,7 @@ def _simulated(site: Site, setup: SiteSetup, folder: Path) -> Store:
     return store
 
 
-def _written(store: Store, site: Site, setup: SiteSetup, folder: Path) -> list[Path]:
+def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> list[Path]:
     frame, names = Frame(site.origin, setup.stride, site.crs), band_names(setup.robot)
     degrees = [np.degrees(primitive.heading) for primitive in setup.primitives]
     events = ", ".join(f"{code} {name}" for code, name in enumerate(("none", *setup.robot.event_names)))
@@ -177,6 +185,14 @@ def _written(store: Store, site: Site, setup: SiteSetup, folder: Path) -> list[P
     ]
 
 
+def _save_grid_map(path: Path, store: Store, site: SiteGround, setup: SiteSetup) -> Path:
+    require_memory(4 * store.bands.nbytes, f"{path}: {store.bands.nbytes} bytes of layers", "; leave --grid-map out")
+    layers = dict(zip(band_names(setup.robot), store.bands[:, ::-1], strict=True)) | {"elevation": store.heights[::-1]}
+    with atomic_write(path) as temporary:
+        write_grid_map(temporary, layers, setup.stride, site.origin)
+    return path
+
+
 def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
     counts = np.zeros(4)
     for top in range(0, len(known), 512):
@@ -187,7 +203,7 @@ def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
     return dict(zip(names, (counts / known.size).tolist(), strict=True))
 
 
-def coarse_note(site: Site, robot: Robot) -> str | None:
+def coarse_note(site: SiteGround, robot: Robot) -> str | None:
     """Returns a line about what the events mean on a site whose cells are coarse; None where they are not."""
     if site.cell_size <= COARSE:
         return None
