@@ -1,6 +1,8 @@
 """Maps of sites: costs and bands by the letter of SPEC section 13, files as GIS and Nav2 read them, and going on."""
 
 import math
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -185,8 +187,8 @@ def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_pa
     site, setup = SiteGround.open(site_file, fill_holes=False), setup_of("leo_rover", 4)
     simulated, parts_of = [], mapping.parts_of
 
-    def stopping(ground, setup, done, after):
-        for number, part in parts_of(ground, setup, done):
+    def stopping(*of, after):
+        for number, part in parts_of(*of):
             simulated.append(number)
             yield number, part
             if len(simulated) == after:
@@ -201,6 +203,27 @@ def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_pa
     assert (
         simulated == list(range(len(kernel.tiles_of(setup.lattice(site.shape))))) and not (tmp_path / FOLDER).exists()
     )
+    with rasterio.open(tmp_path / "map.tif") as one, rasterio.open(mapped[0] / "map.tif") as other:
+        np.testing.assert_array_equal(one.read(), other.read())
+
+
+def test_a_cluster_makes_the_same_map_though_a_worker_dies(site_file, tmp_path, monkeypatch, mapped):
+    distributed = pytest.importorskip("distributed", reason="the extra dask is not installed")
+    monkeypatch.setattr(kernel, "TILE", 8)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        with distributed.Client(cluster) as client:
+            pids = client.run(os.getpid)
+        parts_of = mapping.parts_of
+
+        def losing_a_worker(*of):
+            for number, part in parts_of(*of):
+                if number == 0:
+                    os.kill(next(iter(pids.values())), signal.SIGKILL)
+                yield number, part
+
+        monkeypatch.setattr(mapping, "parts_of", losing_a_worker)
+        site = SiteGround.open(site_file, fill_holes=False)
+        save_map(site, setup_of("leo_rover", 4), tmp_path, scheduler=cluster.scheduler_address)
     with rasterio.open(tmp_path / "map.tif") as one, rasterio.open(mapped[0] / "map.tif") as other:
         np.testing.assert_array_equal(one.read(), other.read())
 
@@ -233,6 +256,8 @@ def test_coarse_cells_are_refused_unless_allowed_and_then_explained(tmp_path):
         (("--headings", 0), "headings = 0: must be a whole number from 1 to 360"),
         (("--spacing", 0), "spacing = 0.0: must be"),
         (("--robot", "nobody"), "robot"),
+        (("--scheduler", "nowhere"), "--scheduler nowhere: cannot be reached"),
+        (("--grid-map", "out.bag"), "--grid-map = 'out.bag': must be a name that ends in .mcap or .db3"),
     ],
 )
 def test_bad_options_are_one_line(site_file, tmp_path, more, message):

@@ -28,6 +28,9 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--grid-map", type=user_path, metavar="FILE", help="also write a GridMap of ROS 2 to this file, .mcap or .db3"
     )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="simulate on a Dask cluster: the address of its scheduler, or local"
+    )
     options.add_out(parser, "runs/map")
     parser.set_defaults(run=run)
 
@@ -51,4 +54,4 @@ def run(arguments: argparse.Namespace) -> None:
     for line in (*site.notes, coarse_note(site, setup.robot)):
         if line:
             progress.say(f"{arguments.site}: {line}")
-    save_map(site, setup, arguments.out, arguments.grid_map)
+    save_map(site, setup, arguments.out, arguments.grid_map, arguments.scheduler)

@@ -1,6 +1,7 @@
 """Maps of whole sites: simulated tile by tile, and written for GIS and navigation (SPEC section 13)."""
 
 from collections.abc import Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from travjax.site.kernel import SiteSetup, tiles_of
 from travjax.site.nav2 import save_nav2
 from travjax.site.primitives import straight_passes
 from travjax.site.store import Store
-from travjax.site.tiling import parts_of
+from travjax.site.tiling import executor, parts_of
 
 COARSE = 0.125
 """Metres: with larger cells a line says what the events still mean."""
@@ -111,9 +112,10 @@ def map_site(
     bands = np.full((len(names), *lattice), np.nan, np.float32)
     costs = np.full((headings, *lattice), UNKNOWN_COST, np.uint8)
     heights = np.full(lattice, np.nan, np.float32)
-    for _, part in parts_of(ground, setup):
-        place = ..., *part.tile.within(lattice)
-        bands[place], costs[place], heights[place] = part.bands, part.costs, part.heights
+    with executor() as pool:
+        for _, part in parts_of(ground, setup, pool):
+            place = ..., *part.tile.within(lattice)
+            bands[place], costs[place], heights[place] = part.bands, part.costs, part.heights
     origin = ground.origin if isinstance(ground, SiteGround) else (0.0, 0.0)
     x, y = (start + setup.stride * np.arange(count) for start, count in zip(origin, lattice[::-1], strict=True))
     angles = 2 * np.pi * np.arange(headings) / headings
@@ -121,20 +123,26 @@ def map_site(
     return SiteMap(dict(zip(names, bands, strict=True)), costs, heights, angles, x, y, crs)
 
 
-def save_map(site: SiteGround, setup: SiteSetup, out: str | Path, grid_map: Path | None = None) -> Path:
+def save_map(
+    site: SiteGround,
+    setup: SiteSetup,
+    out: str | Path,
+    grid_map: Path | None = None,
+    scheduler: str | None = None,
+) -> Path:
     """Maps a site and writes map.tif, headings.tif, the maps for Nav2, figures and shares; returns the folder.
 
     Memory does not grow with the site; a run that was stopped goes on with the tiles that are missing.
-    grid_map: file of ROS 2, .mcap or .db3, that gets the bands and the elevation as layers of a GridMap
+    grid_map:  file of ROS 2, .mcap or .db3, that gets the bands and the elevation as layers of a GridMap
+    scheduler: of a Dask cluster that simulates the tiles, as of tiling.executor
     Raises InputError when rasterio is missing, or rosbags for a GridMap, or when something cannot be read or written.
     """
     rasterio()
     if grid_map is not None:
         rosbags()
         require(grid_map.suffix in (".mcap", ".db3"), "--grid-map", str(grid_map), "a name that ends in .mcap or .db3")
-    folder = output_folder(out)
-    with held(folder):
-        store = _simulated(site, setup, folder)
+    with executor(scheduler) as pool, held(folder := output_folder(out)):
+        store = _simulated(site, setup, folder, pool)
         written = _written(store, site, setup, folder)
         if grid_map is not None:
             written.append(_save_grid_map(grid_map, store, site, setup))
@@ -143,13 +151,13 @@ def save_map(site: SiteGround, setup: SiteSetup, out: str | Path, grid_map: Path
     return folder
 
 
-def _simulated(site: SiteGround, setup: SiteSetup, folder: Path) -> Store:
+def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Executor, int]) -> Store:
     lattice, names = setup.lattice(site.shape), band_names(setup.robot)
     tiles = tiles_of(lattice)
     settings = {"site": site.sha256, "setup": to_json(setup), "lattice": lattice}
     store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
     with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:
-        for number, part in parts_of(site, setup, set(np.flatnonzero(store.done).tolist())):
+        for number, part in parts_of(site, setup, pool, set(np.flatnonzero(store.done).tolist())):
             store.add(number, part)
             bar.update()
     return store
