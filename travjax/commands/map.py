@@ -19,6 +19,12 @@ def add(commands: options.Commands) -> None:
     parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
     options.add_robot_alone(parser)
     options.add_contact_model(parser, "tyre")
+    parser.add_argument(
+        "--method",
+        choices=("passes", "geometric"),
+        default="passes",
+        help="simulate passes, or compute the cost map of UNSTR-NAV, which has no headings, as a baseline (passes)",
+    )
     parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
     parser.add_argument("--stride", type=float, metavar="M", help="metres between places (0.25, or one coarse cell)")
     parser.add_argument(
@@ -54,4 +60,9 @@ def run(arguments: argparse.Namespace) -> None:
     for line in (*site.notes, coarse_note(site, setup.robot)):
         if line:
             progress.say(f"{arguments.site}: {line}")
+    if arguments.method == "geometric":
+        from travjax.site.geometric import save_geometric
+
+        save_geometric(site, setup, arguments.out)
+        return
     save_map(site, setup, arguments.out, arguments.grid_map, arguments.scheduler)

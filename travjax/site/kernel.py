@@ -196,12 +196,8 @@ def _tables(setup: SiteSetup) -> tuple[NearestChunks | TyreChunks, Layout]:
 def _simulate(ground: jax.Array, chunks: NearestChunks | TyreChunks, setup: SiteSetup, layout: Layout) -> Margins:
     robot, around = setup.robot, len(ground) // setup.step
     places = around - 2 * setup.halo
-    start = jnp.asarray(_starts(setup, layout.grid, around))
     heights = jnp.where(jnp.isnan(ground), UNKNOWN_HEIGHT, ground)
-
-    def lanes(field: jax.Array) -> Shifted:
-        return Shifted(sorted_by_phase(field, setup.step, 2 * setup.halo), start, places * around)
-
+    lanes = partial(lanes_of, setup=setup)
     if isinstance(chunks, TyreChunks):
         site = Ground(*(lanes(field[0]) for field in fields(heights[None], robot, setup.spacing)))
         settled = lambda chunk: settle(site, chunk, robot, layout)
@@ -209,8 +205,20 @@ def _simulate(ground: jax.Array, chunks: NearestChunks | TyreChunks, setup: Site
         nodes = lanes(heights)
         settled = lambda chunk: poses_on_nodes(nodes, nodes, chunk, robot.wheelbase, robot.track, layout)
     maxima = jax.lax.map(lambda chunk: arc_maxima(settled(chunk), layout, robot.events)[0][:, 0, 0], chunks)
-    square = maxima.transpose(1, 0, 2).reshape(-1, len(maxima), places, around)[..., :places]
-    return margins_from(square, robot.events)
+    return margins_from(by_place(maxima.transpose(1, 0, 2), around, places), robot.events)
+
+
+def lanes_of(field: Float[jax.Array, "n n"], setup: SiteSetup) -> Shifted:
+    """Returns the ground of a tile as lanes, its places, of nodes in the grid around each; see `by_place`."""
+    around = len(field) // setup.step
+    start = jnp.asarray(_starts(setup, setup.grid, around))
+    heights = sorted_by_phase(field, setup.step, 2 * setup.halo)
+    return Shifted(heights, start, (around - 2 * setup.halo) * around)
+
+
+def by_place(lanes: jax.Array, around: int, places: int) -> jax.Array:
+    """Puts values of lanes [..., lanes] in rows and columns of places; around: of those and what is around them."""
+    return lanes.reshape(*lanes.shape[:-1], places, around)[..., :places]
 
 
 def sorted_by_phase(field: Float[jax.Array, "n n"], step: int, spare: int) -> Float[jax.Array, " m"]:

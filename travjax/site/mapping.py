@@ -23,7 +23,7 @@ from travjax.site.costs import UNKNOWN_COST, band_names
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
 from travjax.site.ground import ArrayGround, SiteGround
 from travjax.site.kernel import SiteSetup, tiles_of
-from travjax.site.nav2 import save_nav2
+from travjax.site.nav2 import over_headings, save_nav2
 from travjax.site.primitives import straight_passes
 from travjax.site.store import Store
 from travjax.site.tiling import executor, parts_of
@@ -186,7 +186,7 @@ def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> 
     return [
         save_geotiff(folder / "map.tif", store.bands, names, frame, float("nan"), tags),
         save_geotiff(folder / "headings.tif", store.costs, layers, frame, UNKNOWN_COST, tags),
-        *save_nav2(folder / "nav2", store.costs, frame),
+        *save_nav2(folder / "nav2", over_headings(store.costs), frame),
         map_figures.save(passable, folder / "map.png"),
         map_figures.save(blocking, folder / "why.png"),
         save_text(folder / "shares.txt", f"{heading}\n{table}\n"),

@@ -4,6 +4,7 @@ A raw map is a PGM of 0 to 100, and 255 where unknown. Its twin in scale mode is
 transparent where unknown. Row 0 of an image is the northernmost.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +18,20 @@ from travjax.site.geotiff import Frame
 Image.MAX_IMAGE_PIXELS = None
 
 
-def save_nav2(folder: Path, costs: UInt8[np.ndarray, "h r c"], frame: Frame) -> list[Path]:
-    """Writes worst, best and mean over the known headings, each in raw and in scale mode.
+def save_nav2(folder: Path, maps: Mapping[str, UInt8[np.ndarray, "r c"]], frame: Frame) -> list[Path]:
+    """Writes maps by name, each in raw and in scale mode; returns the YAML files.
 
-    costs: of each heading, UNKNOWN_COST where unknown, row 0 in the north
-    Returns the YAML files.
+    maps: costs, UNKNOWN_COST where unknown, row 0 in the north
     """
     output_folder(folder)
     files = []
-    for name, values in _over_headings(costs).items():
+    for name, values in maps.items():
         files += [_raw(folder, name, values, frame), _scale(folder, name, values, frame)]
     return files
 
 
-def _over_headings(costs: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the worst, best and mean cost of each place, [rows, cols] uint8."""
+def over_headings(costs: UInt8[np.ndarray, "h r c"]) -> dict[str, UInt8[np.ndarray, "r c"]]:
+    """Returns the worst, best and mean cost of each place over its known headings, row 0 in the north."""
     rows, cols = costs.shape[1:]
     maps = {name: np.empty((rows, cols), np.uint8) for name in ("worst", "best", "mean")}
     for top in range(0, rows, 256):

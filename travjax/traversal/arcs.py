@@ -59,6 +59,8 @@ def read(lanes: Lanes, nodes: Int[Array, "*k"]) -> Float[Array, "*k lanes"]:
     if not isinstance(lanes, Shifted):
         return lanes.at[nodes].get(mode="promise_in_bounds")
     start = read(lanes.start, nodes)
+    if start.ndim == 0:
+        return jax.lax.dynamic_slice(lanes.heights, (start,), (lanes.length,))
     stretches = jax.lax.GatherDimensionNumbers((start.ndim,), (), (0,))
     mode = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
     return jax.lax.gather(lanes.heights, start[..., None], stretches, (lanes.length,), mode=mode)
