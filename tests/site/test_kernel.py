@@ -17,7 +17,7 @@ from travjax.terrain.styles import generate_terrain
 from travjax.traversal import reference, tyre_reference
 from travjax.traversal.traverse import simulate
 
-SEEKUR_JR, HUSKY, LEO_ROVER = map(Robot.load, ("seekur_jr", "husky_a200", "leo_rover"))
+SEEKUR_JR, LEO_ROVER = map(Robot.load, ("seekur_jr", "leo_rover"))
 CURVES = (
     Primitive(0.3, ((0.9, 0.5),)),
     Primitive(2.0, ((-1.2, 0.4), (math.inf, 0.3)), behind=0.1),
@@ -67,14 +67,13 @@ def compare(heights, robot: Robot, primitives, contact: str, stride: float, spac
     return float(np.isfinite(found).mean())
 
 
-@pytest.mark.parametrize("contact", ["nearest", "tyre"])
 @pytest.mark.parametrize(
-    ("robot", "primitives", "stride", "spacing"),
+    ("contact", "robot", "primitives", "stride", "spacing"),
     [
-        (SEEKUR_JR, straight_passes(16), 0.25, 0.0625),
-        (HUSKY, straight_passes(7, 0.3), 0.3, 0.1),
-        (LEO_ROVER, CURVES, 0.1875, 0.0625),
-        (replace(LEO_ROVER, max_roll=0.3), straight_passes(4, 0.05), 0.05, 0.05),
+        ("nearest", SEEKUR_JR, straight_passes(16), 0.25, 0.0625),
+        ("nearest", LEO_ROVER, CURVES, 0.1875, 0.0625),
+        ("tyre", SEEKUR_JR, straight_passes(16), 0.25, 0.0625),
+        ("tyre", replace(LEO_ROVER, max_roll=0.3), CURVES, 0.3, 0.1),
     ],
 )
 def test_margins_are_those_of_the_sequential_simulators(ground, contact, robot, primitives, stride, spacing):
@@ -85,11 +84,10 @@ def test_margins_are_those_of_the_sequential_simulators(ground, contact, robot, 
 def test_bits_do_not_depend_on_the_tiles(ground, contact, monkeypatch):
     whole = simulate_site(ground, contact=contact, stride=0.125)
     assert whole.known.any() and not whole.known.all()
-    for edge in (8, 16):
-        monkeypatch.setattr(kernel, "TILE", edge)
-        tiled = simulate_site(ground, contact=contact, stride=0.125)
-        for name in ("step", "obstacle", "tilt", "known"):
-            np.testing.assert_array_equal(getattr(tiled, name), getattr(whole, name))
+    monkeypatch.setattr(kernel, "TILE", 8)
+    tiled = simulate_site(ground, contact=contact, stride=0.125)
+    for name in ("step", "obstacle", "tilt", "known"):
+        np.testing.assert_array_equal(getattr(tiled, name), getattr(whole, name))
 
 
 def test_tiles_cover_a_lattice_once():
