@@ -228,6 +228,11 @@ def test_a_cluster_makes_the_same_map_though_a_worker_dies(site_file, tmp_path, 
         np.testing.assert_array_equal(one.read(), other.read())
 
 
+def test_what_is_unfinished_was_read_alike(site_file):
+    one, other = SiteGround.open(site_file, fill_holes=False), SiteGround.open(site_file)
+    assert one.sha256 == other.sha256 and one.reading != other.reading
+
+
 def test_what_is_unfinished_of_another_setup_is_not_used(site_file, tmp_path):
     (tmp_path / FOLDER).mkdir()
     (tmp_path / FOLDER / "settings.json").write_text("{}")

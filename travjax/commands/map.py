@@ -5,6 +5,7 @@ import argparse
 from travjax import options, progress
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
+from travjax.signals import going_on
 
 
 def add(commands: options.Commands) -> None:
@@ -65,4 +66,5 @@ def run(arguments: argparse.Namespace) -> None:
 
         save_geometric(site, setup, arguments.out)
         return
-    save_map(site, setup, arguments.out, arguments.grid_map, arguments.scheduler)
+    with going_on("the same command goes on with the tiles that are missing"):
+        save_map(site, setup, arguments.out, arguments.grid_map, arguments.scheduler)

@@ -1,13 +1,14 @@
 """The ground of a whole site at the spacing of nodes, read part by part (SPEC section 11)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Float
 
-from travjax.config import InputError, require
+from travjax.config import InputError, require, to_json
 from travjax.data.dem import height_offsets, naming_file, read_rasters
 from travjax.files import sha256, user_path
 from travjax.rasters.raster import require_fine, require_known, survey
@@ -58,7 +59,8 @@ class SiteGround:
     crs:           coordinate system as the file names it, or None
     cell_size:     metres between values in the file
     height_offset: metres, subtracted from the file's heights
-    path, sha256:  the file and its checksum; notes: lines about how it was read
+    path, sha256:  the file and its checksum; reading: the options it was read with, for JSON
+    notes:         lines about how it was read
     """
 
     spacing: float
@@ -68,6 +70,7 @@ class SiteGround:
     height_offset: float
     path: str
     sha256: str
+    reading: Mapping[str, Any]
     notes: tuple[str, ...]
     _surface: Surface = field(repr=False)
 
@@ -104,7 +107,16 @@ class SiteGround:
             surface = Surface(raster, nodes, above, fill_holes and raster.height_offset is None)
             checksum = sha256(path)
         return SiteGround(
-            nodes, raster.origin, raster.crs, raster.cell_size, offset, str(path), checksum, raster.notes, surface
+            spacing=nodes,
+            origin=raster.origin,
+            crs=raster.crs,
+            cell_size=raster.cell_size,
+            height_offset=offset,
+            path=str(path),
+            sha256=checksum,
+            reading=to_json(reading) | {"fill_holes": fill_holes},
+            notes=raster.notes,
+            _surface=surface,
         )
 
     @property

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -154,7 +155,7 @@ def save_map(
 def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Executor, int]) -> Store:
     lattice, names = setup.lattice(site.shape), band_names(setup.robot)
     tiles = tiles_of(lattice)
-    settings = {"site": site.sha256, "setup": to_json(setup), "lattice": lattice}
+    settings = {"site": site.sha256, "reading": site.reading, "setup": to_json(setup), "travjax": version("travjax")}
     store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
     with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:
         for number, part in parts_of(site, setup, pool, set(np.flatnonzero(store.done).tolist())):
