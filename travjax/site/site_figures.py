@@ -62,8 +62,9 @@ def _every(shape: tuple[int, ...]) -> int:
 def _frame_of(heights: np.ndarray, frame: Frame, what: Sequence[str]):
     rows, cols = heights.shape
     tall = float(np.clip(6.4 * rows / cols, 3.2, 9.0))
-    figure = Figure(figsize=(9.2, tall + 0.8), layout="constrained")
+    figure = Figure(figsize=(9.2, tall + 1.3))
     ax, side = figure.subplots(1, 2, width_ratios=(3.2, 1))
+    figure.subplots_adjust(left=0.1, right=0.98, bottom=0.65 / (tall + 1.3), top=1 - 0.65 / (tall + 1.3), wspace=0.05)
     side.set_axis_off()
     figure.suptitle("\n".join(what), fontsize=10)
     return figure, ax, side
