@@ -11,15 +11,16 @@ import travjax
 LAYERS = {
     "": "config signals locks memory files npz_stream progress jax_flags batching devices",
     "simulation": "arrays grid heights events contact robot actions footprint tyre_tables setup",
-    "traversal": "arcs nearest steps tyre traverse reference tyre_reference pose_by_pose",
+    "traversal": "arcs nearest steps tyre tyre_trajectories traverse reference tyre_reference pose_by_pose",
     "terrain": "noise landforms rock_field styles",
-    "rasters": "coordinates reading_options formats raster gdal_files array_files holes surface",
+    "rasters": "coordinates reading_options formats raster gdal_files grid_maps array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
     "fetched_weights",
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
+    "site": "primitives ground kernel costs tiling geotiff nav2 store site_figures mapping geometric site_benchmark",
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
@@ -27,7 +28,7 @@ LAYERS = {
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
     "timing comparison physics",
-    "commands": "terrain label dataset weights train evaluate export predict physics bench",
+    "commands": "terrain label map dataset weights train evaluate export predict physics bench",
     "program": "cli",
 }
 """Packages from the bottom to the top, those of TOP being travjax itself; in each, its modules likewise."""
@@ -35,7 +36,7 @@ LAYERS = {
 TOP = ("", "programs", "program")
 """Layers of modules that lie in no package."""
 
-MOST = 11
+MOST = 12
 """Modules in a package."""
 
 ORDER = [

@@ -10,6 +10,10 @@ from .simulation.actions import ActionSpace
 from .simulation.events import EVENTS, Margins, Where
 from .simulation.grid import Grid
 from .simulation.robot import Robot
+from .site.ground import SiteGround
+from .site.kernel import simulate_site
+from .site.mapping import SiteMap, map_site
+from .site.primitives import Primitive, straight_passes
 from .terrain.styles import STYLES, TerrainParams, elevation, generate_terrain, sample_params
 from .training.evaluation_report import evaluate_run
 from .training.fit import fit, run_from_preset
@@ -26,7 +30,10 @@ __all__ = [
     "InputError",
     "Margins",
     "Predictor",
+    "Primitive",
     "Robot",
+    "SiteGround",
+    "SiteMap",
     "TerrainParams",
     "Traverse",
     "Where",
@@ -39,10 +46,13 @@ __all__ = [
     "load_dataset",
     "load_dem",
     "load_estimator",
+    "map_site",
     "predict",
     "render_inputs",
     "run_from_preset",
     "sample_params",
     "simulate",
+    "simulate_site",
+    "straight_passes",
     "traverse",
 ]

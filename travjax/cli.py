@@ -4,11 +4,11 @@ import argparse
 from collections.abc import Sequence
 
 import travjax
-from travjax.commands import bench, dataset, evaluate, export, label, physics, predict, terrain, train, weights
+from travjax.commands import bench, dataset, evaluate, export, label, map, physics, predict, terrain, train, weights
 from travjax.config import naming
 from travjax.entry import Parser, guarded, use_compilation_cache
 
-COMMANDS = (terrain, label, dataset, weights, train, evaluate, export, predict, physics, bench)
+COMMANDS = (terrain, label, map, dataset, weights, train, evaluate, export, predict, physics, bench)
 """The commands in the order in which the help lists them."""
 
 

@@ -67,22 +67,32 @@ def add_world(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
-    """Adds the options for robot and action space; see `setup`."""
+def add_robot_alone(parser: argparse.ArgumentParser) -> None:
+    """Adds the option for the robot."""
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
+
+
+def add_robot(parser: argparse.ArgumentParser) -> None:
+    """Adds the options for robot and action space; see `setup`."""
+    add_robot_alone(parser)
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
     add_contact(parser)
 
 
-def add_contact(parser: Options) -> None:
-    """Adds the options for the contact model; see `setup`."""
+def add_contact_model(parser: Options, default: str) -> None:
+    """Adds the option for the contact model; default: the model where neither it nor the robot's file decides."""
     parser.add_argument(
         "--contact",
         choices=CONTACTS,
         help="how wheels and body touch the ground: as in the paper (nearest), or with the wheels' size, the whole "
-        "outline and the point turn (tyre); the robot's file decides unless given, else nearest",
+        f"outline and the point turn (tyre); the robot's file decides unless given, else {default}",
     )
+
+
+def add_contact(parser: Options) -> None:
+    """Adds the options for the contact model; see `setup`."""
+    add_contact_model(parser, "nearest")
     parser.add_argument(
         "--no-turn",
         dest="turn",
@@ -123,14 +133,20 @@ def add_run(parser: Options) -> None:
 
 DEM_OPTIONS = (
     *("stride", "cell_size", "height_scale", "nodata", "keep_holes", "allow_coarse"),
-    *("band", "classes", "up", "gdal_driver"),
+    *("band", "classes", "up", "gdal_driver", "topic", "layer", "time"),
 )
 """Names of the options that `add_dem` adds; each is None or False unless given."""
 
 
 def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
-    """Adds the options for reading elevation maps; see `windows`."""
+    """Adds the options for reading elevation maps and cutting them into windows; see `windows`."""
     parser.add_argument("--stride", type=float, metavar="M", help=f"metres between windows of a DEM ({stride:g})")
+    add_reading(parser)
+    parser.set_defaults(default_stride=stride)
+
+
+def add_reading(parser: argparse.ArgumentParser) -> None:
+    """Adds the options for reading elevation maps; see `reading`."""
     parser.add_argument(
         "--cell-size", type=float, metavar="M", help="metres between a DEM's values, or into which points are put"
     )
@@ -165,7 +181,11 @@ def add_dem(parser: argparse.ArgumentParser, stride: float) -> None:
         metavar="NAME",
         help="a driver of GDAL that may read files beside those of local pixels; may be given again",
     )
-    parser.set_defaults(default_stride=stride)
+    parser.add_argument("--topic", metavar="NAME", help="topic of a recorded GridMap (the only one)")
+    parser.add_argument("--layer", metavar="NAME", help="layer of a recorded GridMap (the only one)")
+    parser.add_argument(
+        "--time", type=float, metavar="S", help="read the latest GridMap until so many seconds from a recording's start"
+    )
 
 
 def _codes(text: str) -> tuple[int, ...]:
@@ -204,7 +224,13 @@ def setup(arguments: argparse.Namespace) -> Setup:
 
 def windows(arguments: argparse.Namespace) -> WindowOptions:
     """Returns the options for reading elevation maps and cutting them into windows."""
-    reading = DemOptions(
+    stride = arguments.default_stride if arguments.stride is None else arguments.stride
+    return WindowOptions(reading(arguments), stride, not arguments.keep_holes, arguments.allow_coarse)
+
+
+def reading(arguments: argparse.Namespace) -> DemOptions:
+    """Returns what is said about the files of elevation maps."""
+    return DemOptions(
         arguments.cell_size,
         arguments.height_scale,
         arguments.nodata,
@@ -212,9 +238,10 @@ def windows(arguments: argparse.Namespace) -> WindowOptions:
         arguments.classes,
         arguments.up,
         tuple(arguments.gdal_driver or ()),
+        arguments.topic,
+        arguments.layer,
+        arguments.time,
     )
-    stride = arguments.default_stride if arguments.stride is None else arguments.stride
-    return WindowOptions(reading, stride, not arguments.keep_holes, arguments.allow_coarse)
 
 
 def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:

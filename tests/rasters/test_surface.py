@@ -24,7 +24,7 @@ def nodes(heights: np.ndarray, cell: float, fill_holes: bool = True) -> np.ndarr
     whole = np.full(surface.shape, np.nan)
     for row in {0, rows[-1]}:
         for col in {0, cols[-1]}:
-            whole[row : row + edge, col : col + edge] = surface.nodes(row, col, edge)
+            whole[row : row + edge, col : col + edge] = surface.nodes(slice(row, row + edge), slice(col, col + edge))
     return whole
 
 
@@ -132,4 +132,4 @@ def test_windows_over_tiles_are_cut_from_them(monkeypatch):
     surface = Surface(Raster(heights, SPACING), SPACING, 5.0, True)
     for row, col in ((0, 0), (15, 15), (16, 31), (59, 79), (3, 70)):
         expected = (heights[row : row + 41, col : col + 41] - 5).astype(np.float32)
-        np.testing.assert_array_equal(surface.nodes(row, col, 41), expected)
+        np.testing.assert_array_equal(surface.nodes(slice(row, row + 41), slice(col, col + 41)), expected)

@@ -15,7 +15,7 @@ from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
 from travjax.traversal import tyre_reference
 from travjax.traversal.traverse import failures, margins_of, places_of, simulate
-from travjax.traversal.tyre import turn_poses
+from travjax.traversal.tyre_trajectories import turn_poses
 
 STRAIGHT = ActionSpace(turns=8, radii=(math.inf,), interval=0.1)
 ONE_AHEAD = replace(STRAIGHT, turns=1)

@@ -1,15 +1,18 @@
-"""`travjax bench`: how fast terrain, labelling and the network are on this machine."""
+"""`travjax bench`: how fast terrain, labelling, the network and site maps are on this machine."""
 
 import argparse
 
 from travjax import options
 from travjax.config import require
+from travjax.files import user_path
 
 
 def add(commands: options.Commands) -> None:
     """Adds the command's parser."""
     parser = commands.add_parser(
-        "bench", help="measure speed", description="Measures terrain and labelling on this machine, or the network."
+        "bench",
+        help="measure speed",
+        description="Measures terrain and labelling on this machine; or the network, or the map of a site.",
     )
     options.add_robot(parser)
     options.add_grid(parser)
@@ -22,12 +25,18 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--network", action="store_true", help="measure the network instead: inputs, a training step, a whole map"
     )
+    parser.add_argument("--site", type=user_path, metavar="SITE", help="measure the map of a site instead")
     options.add_out(parser, "runs/bench")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Measures terrain and labelling, or the network."""
+    """Measures terrain and labelling, the network, or the map of a site."""
+    if arguments.site:
+        from travjax.site import site_benchmark
+
+        site_benchmark.measure(arguments.site, arguments.robot, arguments.out)
+        return
     setup = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")
     if arguments.network:

@@ -20,6 +20,7 @@ from travjax.point_clouds.clouds import cloud_of_arrays, read_cloud
 from travjax.rasters.array_files import rasters_of, read_npy, read_npz
 from travjax.rasters.formats import unfolded
 from travjax.rasters.gdal_files import read_raster
+from travjax.rasters.grid_maps import read_grid_map
 from travjax.rasters.raster import Raster, Survey, require_fine, require_known, require_size, survey
 from travjax.rasters.reading_options import DemOptions
 from travjax.rasters.surface import Surface
@@ -80,9 +81,9 @@ class Windows:
         """Reads some of the windows, [k, rows, cols] as in `heights`; fastest in their own order."""
         corners = self._corners[which]
         cut = np.empty((len(corners), *self._grid.shape), np.float32)
-        with _naming(Path(self.path)):
+        with naming_file(Path(self.path)):
             for window, (surface, row, col) in zip(cut, corners.tolist(), strict=True):
-                window[...] = self._surfaces[surface].nodes(row, col, self._grid.nodes)
+                window[...] = self._surfaces[surface].nodes(*(slice(at, at + self._grid.nodes) for at in (row, col)))
         return cut
 
     def systems(self, which: slice | np.ndarray = slice(None)) -> np.ndarray:
@@ -109,6 +110,9 @@ def load_dem(
     classes: tuple[int, ...] | None = None,
     up: str | None = None,
     gdal_drivers: tuple[str, ...] = (),
+    topic: str | None = None,
+    layer: str | None = None,
+    time: float | None = None,
 ) -> Windows:
     """Cuts a DEM into windows of the grid's size, starting at its south-west corner; partial windows are dropped.
 
@@ -129,6 +133,8 @@ def load_dem(
     classes:      classes of LAS points to use; unless given, ground only, if the file has classified ground
     up:           "y" if that axis of a point cloud or mesh points up; "z" unless given
     gdal_drivers: GDAL drivers that may read the file besides those in gdal_files.DRIVERS
+    topic, layer: of a recording of ROS with a GridMap (.bag, .db3, .mcap); the only ones unless given
+    time:         seconds from the start of a recording, until which the latest map is read; its end unless given
     Raises InputError when the file is missing, is not an elevation map, is in degrees, feet or a system whose units are
     not metres on the ground, has no cell size, a non-square or too large one, or one that differs from the given, has
     infinite or absurd heights or no known ones, is smaller than one window, or does not fit into memory.
@@ -137,9 +143,9 @@ def load_dem(
     require_number("stride", stride, 0, 1e6, "a distance in metres, above 0")
     require(stride > grid.spacing - 1e-9, "stride", stride, f"at least the spacing of the nodes, {grid.spacing:g} m")
     require_grid(grid)
-    options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers)
-    with _naming(path):
-        rasters = _read(path, options, grid)
+    options = DemOptions(cell_size, height_scale, nodata, band, classes, up, gdal_drivers, topic, layer, time)
+    with naming_file(path):
+        rasters = read_rasters(path, options, grid)
         for raster in rasters:
             require_fine(raster.cell_size, allow_coarse)
             north, east = ((edge - 1) * raster.cell_size for edge in raster.heights.shape)
@@ -147,7 +153,7 @@ def load_dem(
         corners, covered = _corners(rasters, stride, grid)
         surveys = [survey(raster.heights) for raster in rasters]
         require_known(sum(found.known for found in surveys))
-        offsets = _offsets(rasters, surveys)
+        offsets = height_offsets(rasters, surveys)
         base = [
             0.0 if raster.height_offset is not None else offset for raster, offset in zip(rasters, offsets, strict=True)
         ]
@@ -179,7 +185,7 @@ def load_dem(
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
+def naming_file(path: Path) -> Iterator[None]:
     """Prefixes errors about a file with its name."""
     try:
         yield
@@ -191,8 +197,8 @@ def _naming(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
 
 
-def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
-    """Reads the rasters of a file according to its content."""
+def read_rasters(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
+    """Reads the rasters of a file according to its content; grid: smallest map, and cells of points."""
     if path.is_dir():
         raise InputError("is a folder; allowed: a file")
     if not path.is_file():
@@ -202,6 +208,8 @@ def _read(path: Path, options: DemOptions, grid: Grid) -> list[Raster]:
             rasters = read_npy(readable, options)
         elif form == "npz":
             rasters = _read_archive(readable, options, grid)
+        elif form == "recording":
+            rasters = [read_grid_map(readable, options)]
         elif form == "raster":
             rasters = [read_raster(readable, options)]
         else:
@@ -242,7 +250,7 @@ def _corners(rasters: list[Raster], stride: float, grid: Grid) -> tuple[np.ndarr
     return np.concatenate(found), float(np.mean(covered))
 
 
-def _offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
+def height_offsets(rasters: list[Raster], surveys: list[Survey]) -> list[float]:
     """Returns the height offset of each raster in whole metres: the same for all unless they are FAR_APART."""
     if rasters[0].height_offset is not None:
         return [raster.height_offset or 0.0 for raster in rasters]

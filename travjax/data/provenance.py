@@ -30,7 +30,7 @@ class Site:
     split: split of its windows that lie in no strip
     test_strip, validation_strip: side of the site and metres; windows that lie wholly in this strip along that side
         belong to the split. The strip starts at the edge of the outermost windows
-    cell_size, height_scale, nodata, band, classes, up, gdal_drivers: as `load_dem` takes them
+    cell_size, height_scale, nodata, band, classes, up, gdal_drivers, topic, layer, time: as `load_dem` takes them
 
     Raises InputError that names field, value and what is allowed.
     """
@@ -47,6 +47,9 @@ class Site:
     classes: tuple[int, ...] | None = None
     up: str | None = None
     gdal_drivers: tuple[str, ...] = ()
+    topic: str | None = None
+    layer: str | None = None
+    time: float | None = None
 
     def __post_init__(self):
         require(isinstance(self.file, str) and bool(self.file), "file", self.file, "a non-empty text")

@@ -167,6 +167,9 @@ def _windows(site: Site, config: SitesConfig, grid: Grid) -> Windows:
         classes=site.classes,
         up=site.up,
         gdal_drivers=site.gdal_drivers,
+        topic=site.topic,
+        layer=site.layer,
+        time=site.time,
         fill_holes=config.fill_holes,
         allow_coarse=config.allow_coarse,
     )

@@ -13,6 +13,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -23,6 +24,7 @@ from travjax.config import InputError
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, output_folder
+from travjax.simulation.contact import CONTACTS, Contact
 from travjax.simulation.setup import Setup
 from travjax.terrain.styles import STYLES, generate_terrain
 from travjax.traversal import reference
@@ -84,7 +86,7 @@ def measure(setup: Setup, out: str | Path, repeats: int = 15, stream: int = 0) -
     # First calls must compile rather than read the cache.
     jax.config.update("jax_enable_compilation_cache", False)
     measured = kernel_rows(setup, repeats)
-    rows += list(progress.bar("kernels", 2 * len(BATCHES), "row", iterable=measured))
+    rows += list(progress.bar("kernels", (1 + len(CONTACTS)) * len(BATCHES), "row", iterable=measured))
     with progress.bar("sequential simulator", len(setup.actions), "trajectory") as bar:
         rows.append(reference_row(setup, lambda done: bar.update(done - bar.n)))
     if stream:
@@ -92,7 +94,7 @@ def measure(setup: Setup, out: str | Path, repeats: int = 15, stream: int = 0) -
             rows.append(stream_row(stream, setup, bar.update))
     rows = with_speed_up(rows)
     write_rows(rows, COLUMNS, folder / "bench.tsv")
-    kernels = [row for row in rows if row["what"] in ("terrain", "labelling")]
+    kernels = [row for row in rows if row["what"].startswith(("terrain", "labelling")) and row["repeats"] > 1]
     progress.wrote(map_figures.save(map_figures.speed_figure(kernels), folder / "bench.png"))
 
 
@@ -105,20 +107,22 @@ def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
 
 
 def kernel_rows(setup: Setup, repeats: int) -> Iterator[dict]:
-    """Measures terrain and labelling on compiled code, and yields a row for each batch size."""
+    """Measures terrain, and labelling by each contact model, on compiled code; yields a row for each batch size."""
     for maps in BATCHES:
         styles, seeds = _mixture(0, maps)
         make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=setup.grid)
         yield _timed("terrain", maps, make, repeats, 0)
-    for maps in BATCHES:
-        yield labelling_row(maps, setup, repeats)
+    for contact in CONTACTS:
+        for maps in BATCHES:
+            yield labelling_row(maps, replace(setup, contact=Contact.from_model(contact)), repeats)
 
 
 def labelling_row(maps: int, setup: Setup, repeats: int) -> dict:
     """Measures labelling of this many maps at once, on compiled code."""
     heights = generate_terrain(*_mixture(0, maps), grid=setup.grid)
     heights = heights[0] if maps == 1 else heights
-    return _timed("labelling", maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
+    what = "labelling" if setup.contact.model == "nearest" else f"labelling, {setup.contact.model}"
+    return _timed(what, maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
 
 
 def reference_row(setup: Setup, on_progress: Callable[[int], object], repeats: int = 1) -> dict:

@@ -49,6 +49,9 @@ MAGIC = {
     b"ply\r": "ply",
     b"glTF": "mesh",
     b"\x1f\x8b": "gzip",
+    b"#ROSBAG V2.0\n": "recording",
+    b"SQLite format 3\0": "recording",
+    b"\x89MCAP0\r\n": "recording",
 }
 
 ENCODINGS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
@@ -57,12 +60,15 @@ ENCODINGS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "
 MOST_UNFOLDED = 2**35
 """Bytes to which a packed file may unfold: 32 GiB."""
 
-OTHERS = ".npy, .npz, .xyz, .txt, .csv, .pts, .ply, .las, .laz, .pcd, .obj, .stl, .glb, .gltf, and any of them as .gz"
+OTHERS = (
+    ".npy, .npz, .xyz, .txt, .csv, .pts, .ply, .las, .laz, .pcd, .obj, .stl, .glb, .gltf, ROS's .bag, .db3 and .mcap, "
+    "and any of them as .gz"
+)
 """What is read beside the rasters of GDAL, for help and messages."""
 
 
 def form_of(path: Path) -> str:
-    """Returns "npy", "npz", "las", "ply", "pcd", "mesh", "text" (of points) or "raster".
+    """Returns "npy", "npz", "las", "ply", "pcd", "mesh", "text" (of points), "recording" (of ROS) or "raster".
 
     Or how a file has to be unfolded: "gzip", "utf-16", "utf-8-sig", or "commas" for a grid with decimal commas.
     """

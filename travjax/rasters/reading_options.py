@@ -19,6 +19,8 @@ class DemOptions:
     classes:      of LAS points that are ground; ground alone where the file has it beside others, unless given
     up:           axis of a point cloud or mesh that points up, "z" unless given
     gdal_drivers: drivers of GDAL that may read the file beside those of local pixels
+    topic, layer: of a recording of ROS, the GridMap to read; the only ones unless given
+    time:         seconds from the start of a recording, until which the latest map is read; its end unless given
 
     Raises InputError that names field, value and what is allowed.
     """
@@ -30,6 +32,9 @@ class DemOptions:
     classes: tuple[int, ...] | None = None
     up: str | None = None
     gdal_drivers: tuple[str, ...] = ()
+    topic: str | None = None
+    layer: str | None = None
+    time: float | None = None
 
     def __post_init__(self):
         for name in ("cell_size", "height_scale"):
@@ -49,4 +54,9 @@ class DemOptions:
             require(codes and bool(self.classes), "classes", self.classes, "codes from 0 to 255, as in (2, 9)")
         names = isinstance(self.gdal_drivers, tuple) and all(isinstance(name, str) for name in self.gdal_drivers)
         require(names, "gdal_drivers", self.gdal_drivers, 'names of drivers, as in ("BAG",)')
+        for name in ("topic", "layer"):
+            value = getattr(self, name)
+            require(value is None or isinstance(value, str) and bool(value), name, value, "a name")
+        if self.time is not None:
+            require_number("time", self.time, -1e-9, 1e9, "seconds from 0")
         require(self.up is None or self.up in AXES_UP, "up", self.up, f"one of {', '.join(AXES_UP)}")

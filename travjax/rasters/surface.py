@@ -36,19 +36,24 @@ class Surface:
         self._tiles: OrderedDict[tuple[int, int], np.ndarray] = OrderedDict()
         self._kept = 2 * -(-cols // self._edge) + 2  # two rows of tiles: windows go from west to east
 
-    def nodes(self, row: int, col: int, count: int) -> np.ndarray:
-        """Returns the map [count, count] float32 whose south-west node is that row and column; NaN unknown."""
-        cut = np.empty((count, count), np.float32)
-        for i in range(row // self._edge, (row + count - 1) // self._edge + 1):
-            for j in range(col // self._edge, (col + count - 1) // self._edge + 1):
+    def nodes(self, rows: slice, cols: slice) -> np.ndarray:
+        """Returns the nodes of some rows and columns, [rows, cols] float32 metres, NaN unknown and off the raster."""
+        cut = np.full((rows.stop - rows.start, cols.stop - cols.start), np.nan, np.float32)
+        for i in self._tiles_along(rows, 0):
+            for j in self._tiles_along(cols, 1):
                 south, west = i * self._edge, j * self._edge
                 tile = self._tile(i, j)
-                rows = slice(max(row, south), min(row + count, south + len(tile)))
-                cols = slice(max(col, west), min(col + count, west + tile.shape[1]))
-                cut[rows.start - row : rows.stop - row, cols.start - col : cols.stop - col] = tile[
-                    rows.start - south : rows.stop - south, cols.start - west : cols.stop - west
-                ]
+                row = slice(max(rows.start, south), min(rows.stop, south + len(tile)))
+                col = slice(max(cols.start, west), min(cols.stop, west + tile.shape[1]))
+                cut[row.start - rows.start : row.stop - rows.start, col.start - cols.start : col.stop - cols.start] = (
+                    tile[row.start - south : row.stop - south, col.start - west : col.stop - west]
+                )
         return cut
+
+    def _tiles_along(self, nodes: slice, axis: int) -> range:
+        """Returns the numbers of the tiles that hold some of these rows or columns."""
+        first, last = max(nodes.start, 0), min(nodes.stop, self.shape[axis]) - 1
+        return range(first // self._edge, last // self._edge + 1) if first <= last else range(0)
 
     def _tile(self, i: int, j: int) -> np.ndarray:
         if (i, j) not in self._tiles:

@@ -90,11 +90,11 @@ class ActionSpace:
 
     def first_stations(self) -> np.ndarray:
         """Returns the path lengths of the poses along the first arc, junction included: [29] metres."""
-        return np.append(_stations(self.arc_lengths[0], self.interval), self.arc_lengths[0])
+        return np.append(stations(self.arc_lengths[0], self.interval), self.arc_lengths[0])
 
     def second_stations(self) -> np.ndarray:
         """Returns the path lengths of the poses along the second arc, junction excluded: [28] metres."""
-        return np.append(_stations(self.arc_lengths[1], self.interval)[1:], self.arc_lengths[1])
+        return np.append(stations(self.arc_lengths[1], self.interval)[1:], self.arc_lengths[1])
 
     def first_poses(self, turn, first) -> np.ndarray:
         """Computes the poses of first arcs: [..., 29, 3] for integer arrays `turn`, `first` [...]."""
@@ -112,7 +112,8 @@ class ActionSpace:
         return np.concatenate([self.first_poses(turn, first), self.second_poses(turn, first, second)], axis=-2)
 
 
-def _stations(length: float, interval: float) -> np.ndarray:
+def stations(length: float, interval: float) -> np.ndarray:
+    """Returns the path lengths of poses from the start of an arc to before its end, in metres."""
     return np.arange(math.ceil((length - 1e-9) / interval)) * interval
 
 

@@ -125,20 +125,43 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     views = views_of(actions)
     turn, first = _first_arcs(actions, views)
     poses = _poses(actions, turn, first, np.arange(len(actions.radii)))
-    flat = poses.reshape(-1, 3)
-    row, start, count = _chassis_rows(flat, robot, grid, actions.arc_lengths)
+    return _table(
+        poses,
+        _wheel_nodes(actions, views, turn, first, robot, grid),
+        _source(actions, views, turn, first),
+        Layout(grid, views, poses.shape[1], len(actions.first_stations()), len(actions.radii)),
+        robot,
+        f"arc_lengths = {actions.arc_lengths}",
+    )
+
+
+def pose_table(poses: np.ndarray, robot: Robot, grid: Grid) -> NodeTable:
+    """Builds the table of paths that are given by their poses, [F, P, 3], without second arcs and further views.
+
+    Raises InputError when one of them leaves the map.
+    """
+    right, forward = np.array(robot.wheel_positions()).T
+    wheels = _nodes_under(poses, right, forward, grid, "poses")[..., None]
+    layout = Layout(grid, (View(),), poses.shape[1], poses.shape[1], 0)
+    return _table(poses, wheels, np.arange(len(poses)), layout, robot, "poses")
+
+
+def _table(poses: np.ndarray, wheels: np.ndarray, source: np.ndarray, layout: Layout, robot: Robot, what: str):
+    """Completes a NodeTable; what: the argument that errors name."""
+    grid, flat = layout.grid, poses.reshape(-1, 3)
+    row, start, count = _chassis_rows(flat, robot, grid, what)
     centre = np.floor(flat[:, 1::-1] / grid.spacing + grid.cells / 2 + 0.5).astype(np.int32)
     chassis = np.stack([row - centre[:, :1], start - centre[:, 1:], count], axis=1).astype(np.int16)
     by_arc = lambda array: np.ascontiguousarray(array).reshape(*poses.shape[:2], *array.shape[1:])
     return NodeTable(
         poses=poses,
-        wheels=_wheel_nodes(actions, views, turn, first, robot, grid),
+        wheels=wheels.astype(np.int32),
         centre=by_arc(centre[:, 0] * grid.nodes + centre[:, 1]),
         offset=by_arc((flat[:, :2] / grid.spacing + grid.cells / 2 - centre[:, ::-1]).astype(np.float32)),
         axes=by_arc(np.stack([np.cos(flat[:, 2]), np.sin(flat[:, 2])], axis=-1).astype(np.float32)),
         chassis=by_arc(chassis),
-        source=_source(actions, views, turn, first),
-        layout=Layout(grid, views, poses.shape[1], len(actions.first_stations()), len(actions.radii)),
+        source=source,
+        layout=layout,
     )
 
 
@@ -192,13 +215,19 @@ def _wheel_nodes(actions, views, turn, first, robot: Robot, grid: Grid) -> np.nd
     for view in views:
         true_turn, true_first = view.arc(turn, first, actions)
         poses = _poses(actions, true_turn, true_first, view.second(np.arange(len(actions.radii)), actions))
-        x, y, heading = (poses[..., axis, None] for axis in range(3))
-        sin, cos, aside = np.sin(heading), np.cos(heading), -right if view.mirrored else right
-        col = nearest(x + cos * aside - sin * forward, grid)
-        row = nearest(y + sin * aside + cos * forward, grid)
-        _check_inside(row, col, grid, actions.arc_lengths)
-        nodes.append(row * grid.nodes + col)
-    return np.stack(nodes, axis=-1).astype(np.int32)
+        aside = -right if view.mirrored else right
+        nodes.append(_nodes_under(poses, aside, forward, grid, f"arc_lengths = {actions.arc_lengths}"))
+    return np.stack(nodes, axis=-1)
+
+
+def _nodes_under(poses: np.ndarray, right: np.ndarray, forward: np.ndarray, grid: Grid, what: str) -> np.ndarray:
+    """Finds the nodes nearest to places of the robot (right, forward) [4] at poses [..., 3]: [..., 4]."""
+    x, y, heading = (poses[..., axis, None] for axis in range(3))
+    sin, cos = np.sin(heading), np.cos(heading)
+    col = nearest(x + cos * right - sin * forward, grid)
+    row = nearest(y + sin * right + cos * forward, grid)
+    _check_inside(row, col, grid, what)
+    return row * grid.nodes + col
 
 
 def nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
@@ -206,9 +235,7 @@ def nearest(coordinate: np.ndarray, grid: Grid) -> np.ndarray:
     return np.floor(coordinate / grid.spacing + grid.cells / 2 + 0.5 + TIE).astype(int)
 
 
-def _chassis_rows(
-    poses: np.ndarray, robot: Robot, grid: Grid, lengths: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _chassis_rows(poses: np.ndarray, robot: Robot, grid: Grid, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Returns the chassis nodes of each pose row by row: row, first column and number of columns, [P, rows] each."""
     width, length = robot.chassis_width / 2 + TIE, robot.chassis_length / 2 + TIE
     reach = math.ceil(math.hypot(width, length) / grid.spacing)
@@ -228,7 +255,7 @@ def _chassis_rows(
             f"spacing = {grid.spacing:g}: too coarse for {robot.name}, no node under its chassis at "
             f"{bare.sum()} poses; allowed: up to {min(robot.chassis_width, robot.chassis_length) / math.sqrt(2):.3g} m"
         )
-    _check_inside(row[count > 0], np.concatenate([start[count > 0], stop[count > 0]]), grid, lengths)
+    _check_inside(row[count > 0], np.concatenate([start[count > 0], stop[count > 0]]), grid, what)
     return row, start, count
 
 
@@ -239,11 +266,11 @@ def _interval(factor: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np
     return np.minimum(a, b), np.maximum(a, b)
 
 
-def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid, lengths: tuple[float, float]) -> None:
+def _check_inside(row: np.ndarray, col: np.ndarray, grid: Grid, what: str) -> None:
     outside = max(-row.min(), -col.min(), row.max() - grid.cells, col.max() - grid.cells)
     if outside > 0:
         raise InputError(
-            f"arc_lengths = {lengths}: trajectories leave the {grid.size:g} m map by {outside * grid.spacing:g} m; "
+            f"{what}: trajectories leave the {grid.size:g} m map by {outside * grid.spacing:g} m; "
             "allowed: arcs short enough for wheels and chassis to stay on it, or a larger map (--size)"
         )
 

@@ -52,6 +52,21 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     return jnp.asarray(maps, jnp.float32), heights.ndim == 2
 
 
+def as_site(heights: Any) -> Float[np.ndarray, "rows cols"]:
+    """Returns a checked float32 raster of any size, NaN where unknown, relative to its median height in whole metres.
+
+    Raises InputError when heights are not numbers in two dimensions, and for impossible ones, as `as_maps` does.
+    """
+    array = np.asarray(numbers("heights", heights, "numbers (metres)"))
+    if array.ndim != 2 or array.size == 0:
+        raise InputError(f"heights: shape {list(array.shape)}: must be [rows, cols], one raster")
+    _require_ground(array)
+    require_close(array)
+    known = array[np.isfinite(array)]
+    level = np.round(np.median(known)) if known.size else 0.0
+    return (array - level).astype(np.float32)
+
+
 @jax.jit
 def _unmarked(maps: jax.Array) -> jax.Array:
     """Replaces common markers of unknown ground by NaN; runs on the device, without waiting for the result."""

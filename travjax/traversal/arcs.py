@@ -8,11 +8,12 @@ time; footprint.py explains the letters in shapes.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
 
 from travjax.simulation.events import Event, Margins, Nodes, Pose, Where, larger
 from travjax.simulation.footprint import Layout
@@ -32,6 +33,37 @@ def node_lanes(fields: jax.Array) -> jax.Array:
     """Puts fields [n, rows, cols] of maps side by side: [nodes, n]."""
     # Without the barrier XLA recomputes the array for every element that is gathered from it.
     return jax.lax.optimization_barrier(fields.reshape(len(fields), -1).T)
+
+
+@partial(jax.tree_util.register_dataclass, data_fields=["heights", "start"], meta_fields=["length"])
+@dataclass(frozen=True)
+class Shifted:
+    """Lanes that are places of one large map: a node, counted from each place, is a stretch of memory.
+
+    heights: [m] of the map, in such an order that places side by side see nodes side by side
+    start:   [nodes] int32 where the stretch of a node begins
+    length:  number of lanes
+    """
+
+    heights: Float[Array, " m"]
+    start: Int[Array, " nodes"]
+    length: int
+
+
+Lanes = jax.Array | Shifted
+"""Heights of maps or places side by side: [nodes, lanes], or `Shifted`."""
+
+
+def read(lanes: Lanes, nodes: Int[Array, "*k"]) -> Float[Array, "*k lanes"]:
+    """Reads nodes of all lanes."""
+    if not isinstance(lanes, Shifted):
+        return lanes.at[nodes].get(mode="promise_in_bounds")
+    start = read(lanes.start, nodes)
+    if start.ndim == 0:
+        return jax.lax.dynamic_slice(lanes.heights, (start,), (lanes.length,))
+    stretches = jax.lax.GatherDimensionNumbers((start.ndim,), (), (0,))
+    mode = jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
+    return jax.lax.gather(lanes.heights, start[..., None], stretches, (lanes.length,), mode=mode)
 
 
 def view_lanes(by_node: jax.Array, layout: Layout) -> jax.Array:
@@ -62,14 +94,14 @@ class Poses:
 def arc_maxima(poses: Poses, layout: Layout, events: tuple[Event, ...]) -> tuple[jax.Array, jax.Array | None]:
     """Returns the largest value of each event, and the largest height of contacts and clearances, along both arcs.
 
-    [E + 1, A, R, lanes], and [2, E, A, R, lanes] the number of the pose and the node where each event is largest, if
-    nodes are asked for.
+    [E + 1, A, R, lanes], R = 1 without second arcs, and [2, E, A, R, lanes] the number of the pose and the node where
+    each event is largest, if nodes are asked for.
     """
     arcs = _arc_poses(poses, layout)
     # The barrier keeps XLA from recomputing the maxima of a first arc for each second arc.
-    maxima = [jax.lax.optimization_barrier(pose_maxima(arc, events)) for arc in arcs]
+    maxima = [jax.lax.optimization_barrier(pose_maxima(arc, events)) for arc in arcs if arc]
     if poses.nodes is None:
-        return larger(*maxima), None
+        return reduce(larger, maxima), None
     places = [pose_places(arc, events, first) for arc, first in zip(arcs, (0, layout.first_poses), strict=True)]
     later = maxima[1][:-1] > maxima[0][:-1]
     return larger(*maxima), jnp.where(later, places[1], places[0])
@@ -107,7 +139,8 @@ def _arc_poses(poses: Poses, layout: Layout) -> tuple[list[Pose], ...]:
     def along(field: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
         field = field.reshape(-1, layout.poses, field.shape[-1])
         first, second = field[:, : layout.first_poses], field[:, layout.first_poses :]
-        second = second.reshape(len(second), layout.second_arcs, -1, second.shape[-1])
+        each = (layout.poses - layout.first_poses) // max(layout.second_arcs, 1)
+        second = second.reshape(len(second), layout.second_arcs, each, second.shape[-1])
         along_first = [first[:, pose, None] for pose in range(first.shape[1])]
         return along_first, [second[:, :, pose] for pose in range(second.shape[2])]
 

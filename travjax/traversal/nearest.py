@@ -14,17 +14,20 @@ import numpy as np
 
 from travjax.batching import rounded
 from travjax.simulation.events import PAPER, Event, Margins, Nodes, Where, larger
-from travjax.simulation.footprint import RUN, Layout, chassis_places
+from travjax.simulation.footprint import RUN, Layout, NodeTable, chassis_places
 from travjax.simulation.setup import Setup
 from travjax.traversal.arcs import (
     UNKNOWN_HEIGHT,
+    Lanes,
     Poses,
+    Shifted,
     above_centre,
     arc_maxima,
     by_trajectory,
     margins_from,
     node_lanes,
     on_map,
+    read,
     view_lanes,
     where_of,
 )
@@ -45,7 +48,7 @@ NODES_AT_ONCE = 8
     meta_fields=[],
 )
 @dataclass(frozen=True)
-class _Chunks:
+class NearestChunks:
     """The pose arrays of a NodeTable cut into chunks, laid out in the order in which they are read.
 
     wheels: [C, 4, A P, V]; centre, offset, axes: [C, A P, ...]; runs, singles: [C, steps, A P, 2, places], where steps
@@ -68,32 +71,39 @@ def nearest_margins(maps: jax.Array, setup: Setup, where: bool) -> tuple[Margins
 
 
 @lru_cache(maxsize=8)
-def _device_tables(setup: Setup, maps: int, single: bool) -> tuple[_Chunks, jax.Array]:
+def _device_tables(setup: Setup, maps: int, single: bool) -> tuple[NearestChunks, jax.Array]:
     """Puts the chunks of a NodeTable for batches of `maps` maps, and its `source`, on the device.
 
     single: whether chassis nodes are read one by one, without runs
     """
     table = setup.node_table()
-    runs, singles = chassis_places(table.chassis, 1 if single else RUN)
     arcs = len(table.centre)
     if jax.default_backend() == "cpu":
         arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
+    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
+        return nearest_chunks(table, arcs, single), jnp.asarray(table.source)
+
+
+def nearest_chunks(table: NodeTable, arcs: int, single: bool) -> NearestChunks:
+    """Cuts a table into chunks of so many arcs, and puts it on the device.
+
+    single: whether chassis nodes are read one by one, without runs
+    """
+    runs, singles = chassis_places(table.chassis, 1 if single else RUN)
     padding = -len(table.centre) % arcs
 
     def cut(array):
         array = np.concatenate([array, array[:1].repeat(padding, axis=0)])
         return array.reshape(len(array) // arcs, arcs * array.shape[1], *array.shape[2:])
 
-    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
-        chunks = _Chunks(
-            wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
-            centre=jnp.asarray(cut(table.centre)),
-            offset=jnp.asarray(cut(table.offset)),
-            axes=jnp.asarray(cut(table.axes)),
-            runs=jnp.asarray(_scan_order(cut(runs))),
-            singles=jnp.asarray(_scan_order(cut(singles))),
-        )
-        return chunks, jnp.asarray(table.source)
+    return NearestChunks(
+        wheels=jnp.asarray(cut(table.wheels).transpose(0, 2, 1, 3)),
+        centre=jnp.asarray(cut(table.centre)),
+        offset=jnp.asarray(cut(table.offset)),
+        axes=jnp.asarray(cut(table.axes)),
+        runs=jnp.asarray(_scan_order(cut(runs))),
+        singles=jnp.asarray(_scan_order(cut(singles))),
+    )
 
 
 def _scan_order(places: np.ndarray) -> np.ndarray:
@@ -108,7 +118,7 @@ def _scan_order(places: np.ndarray) -> np.ndarray:
 @partial(jax.jit, static_argnames=("layout", "events", "where"))
 def _simulate(
     maps,
-    chunks: _Chunks,
+    chunks: NearestChunks,
     source,
     wheelbase,
     track,
@@ -120,16 +130,8 @@ def _simulate(
     by_node = node_lanes(above_centre(maps, grid))
     views = view_lanes(by_node, layout)
 
-    def simulate_chunk(chunk: _Chunks) -> tuple[jax.Array, jax.Array | None]:
-        contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
-        plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
-        if where:
-            clearance, body = _highest_node(views, plane, chunk, grid.nodes)
-            nodes = _nodes(chunk, body, layout)
-        else:
-            clearance, nodes = _highest_above(views, plane, chunk, grid.nodes), None
-        poses = Poses(contact, None, plane.pitch, plane.roll, plane.steepness, clearance, nodes)
-        return arc_maxima(poses, layout, events)
+    def simulate_chunk(chunk: NearestChunks) -> tuple[jax.Array, jax.Array | None]:
+        return arc_maxima(poses_on_nodes(by_node, views, chunk, wheelbase, track, layout, where), layout, events)
 
     maxima, places = jax.lax.map(simulate_chunk, chunks)
     margins = margins_from(by_trajectory(maxima, source, len(maps)), events)
@@ -139,7 +141,31 @@ def _simulate(
     return margins, where_of(places, margins.known, grid.nodes)
 
 
-def _nodes(chunk: _Chunks, body: jax.Array, layout: Layout) -> Nodes:
+def poses_on_nodes(
+    by_node: Lanes,
+    views: Lanes,
+    chunk: NearestChunks,
+    wheelbase: float | jax.Array,
+    track: float | jax.Array,
+    layout: Layout,
+    where: bool = False,
+) -> Poses:
+    """Puts the robot on the nodes of maps, and of their views, at the poses of one chunk.
+
+    where: whether to find the nodes too
+    """
+    grid = layout.grid
+    contact = jax.lax.optimization_barrier(_contacts(by_node, chunk.wheels))
+    plane = _pose_planes(contact, chunk, wheelbase, track, grid.spacing)
+    if where:
+        clearance, body = _highest_node(views, plane, chunk, grid.nodes)
+        nodes = _nodes(chunk, body, layout)
+    else:
+        clearance, nodes = _highest_above(views, plane, chunk, grid.nodes), None
+    return Poses(contact, None, plane.pitch, plane.roll, plane.steepness, clearance, nodes)
+
+
+def _nodes(chunk: NearestChunks, body: jax.Array, layout: Layout) -> Nodes:
     """Returns where the robot touches the ground at every pose: [A P, lanes] nodes of the map each."""
     maps = body.shape[1] // len(layout.views)
     wheels = tuple(jnp.repeat(wheel, maps, axis=1) for wheel in chunk.wheels)
@@ -147,9 +173,9 @@ def _nodes(chunk: _Chunks, body: jax.Array, layout: Layout) -> Nodes:
     return Nodes(wheels, on_map(body, layout), on_map(centre, layout))
 
 
-def _contacts(by_node: jax.Array, wheels: jax.Array) -> jax.Array:
+def _contacts(by_node: Lanes, wheels: jax.Array) -> jax.Array:
     """Gathers the contact heights of the wheels: [4, A P, lanes]."""
-    heights = by_node.at[wheels].get(mode="promise_in_bounds")
+    heights = read(by_node, wheels)
     return heights.reshape(*heights.shape[:2], -1)
 
 
@@ -168,7 +194,7 @@ class _Planes:
     steepness: jax.Array
 
 
-def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: float) -> _Planes:
+def _pose_planes(contact: jax.Array, chunk: NearestChunks, wheelbase, track, spacing: float) -> _Planes:
     """Fits the least-squares planes to the four contacts.
 
     Each sum includes at most one unrounded product, so that a map gives the same bits in any batch, however the loop is
@@ -187,7 +213,7 @@ def _pose_planes(contact: jax.Array, chunk: _Chunks, wheelbase, track, spacing: 
     return _Planes(jax.lax.optimization_barrier(level), east, north, pitch, roll, steepness)
 
 
-def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> jax.Array:
+def _highest_above(views: Lanes, plane: _Planes, chunk: NearestChunks, cols: int) -> jax.Array:
     """Returns the largest height of a chassis node above the pose plane: [A P, lanes]."""
     highest = _scan_places(views, plane, chunk.centre, chunk.singles, 1, cols)
     if not len(chunk.runs):
@@ -196,7 +222,7 @@ def _highest_above(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) 
     return reduce(larger, jnp.split(in_runs, RUN, axis=1), highest)
 
 
-def _highest_node(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -> tuple[jax.Array, jax.Array]:
+def _highest_node(views: Lanes, plane: _Planes, chunk: NearestChunks, cols: int) -> tuple[jax.Array, jax.Array]:
     """Returns the largest height of a chassis node above the pose plane, and that node in the view: [A P, lanes] each.
 
     All places of the chunk are single.
@@ -207,7 +233,7 @@ def _highest_node(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -
         for k in range(group.shape[-1]):
             row, col = group[:, 0, k].astype(jnp.int32), group[:, 1, k].astype(jnp.int32)
             node = chunk.centre + row * cols + col
-            height = views.at[node].get(mode="promise_in_bounds")
+            height = read(views, node)
             level = plane.level + plane.east * col[:, None].astype(jnp.float32)
             above = height - (level + plane.north * row[:, None].astype(jnp.float32))
             at = jnp.where(above > highest, node[:, None], at)
@@ -218,16 +244,18 @@ def _highest_node(views: jax.Array, plane: _Planes, chunk: _Chunks, cols: int) -
     return jax.lax.scan(step, (lowest, jnp.zeros(lowest.shape, jnp.int32)), chunk.singles)[0]
 
 
-def _scan_places(views, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
+def _scan_places(views: Lanes, plane: _Planes, centre, places, run: int, cols: int) -> jax.Array:
     """Returns the largest height above the pose plane over all places, for each of `run` nodes: [A P, run * lanes]."""
-    nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
-    aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), views.shape[1])
+    nodes = views
+    if not isinstance(views, Shifted):
+        nodes = jnp.concatenate([jnp.roll(views, -k, axis=0) for k in range(run)], axis=1)
+    aside = jnp.repeat(jnp.arange(run, dtype=jnp.float32), plane.level.shape[1])
     level, east, north = (jnp.tile(field, (1, run)) for field in (plane.level, plane.east, plane.north))
 
     def step(highest, group):
         for k in range(group.shape[-1]):
             row, col = group[:, 0, k], group[:, 1, k]
-            height = nodes.at[centre + row.astype(jnp.int32) * cols + col].get(mode="promise_in_bounds")
+            height = read(nodes, centre + row.astype(jnp.int32) * cols + col)
             columns = col.astype(jnp.float32)[:, None] + aside
             above = height - (level + east * columns + north * row.astype(jnp.float32)[:, None])
             highest = larger(above, highest)

@@ -35,6 +35,12 @@ def nodes_within(distance: float, spacing: float) -> int:
     return max(1, math.floor((distance + TIE) / spacing))
 
 
+def reach_of_steps(radius: float, spacing: float) -> int:
+    """Returns how many nodes away ground may be that the step of a node depends on."""
+    within = nodes_within(radius, spacing)
+    return (within + 1) + 2 * max(LEAST, within)
+
+
 def without_gaps(heights: Float[Array, "n r c"], radius: float, spacing: float) -> Float[Array, "n r c"]:
     """Fills the trenches and holes of maps that a tyre bridges.
 

@@ -18,7 +18,7 @@ from travjax.simulation.heights import Heights, as_maps
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup, chosen_robot
 from travjax.traversal.nearest import nearest_margins
-from travjax.traversal.tyre import tyre_margins
+from travjax.traversal.tyre_trajectories import tyre_margins
 
 
 @usual_flags()

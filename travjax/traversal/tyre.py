@@ -1,49 +1,34 @@
 """The `tyre` contact model: wheels with radius and width, and the whole outline (SPEC section 15).
 
 heights and steps of a map, and the table of some poses (tyre_tables.py) -> the pose plane on the resting heights of the
-four wheels, the step and the clearance at each pose. traverse.py makes the margins of trajectories of them, as it does
-for the paper's contact model; the letters in shapes are explained in footprint.py. N is the number of poses.
+four wheels, the step and the clearance at each pose. tyre_trajectories.py makes the margins of trajectories of them;
+the letters in shapes are explained in footprint.py. N is the number of poses.
 """
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from travjax.batching import rounded
-from travjax.simulation.actions import ActionSpace
-from travjax.simulation.events import Margins, Nodes, Pose, Where, larger
-from travjax.simulation.footprint import Layout, View
+from travjax.simulation.events import Nodes, larger
+from travjax.simulation.footprint import Layout
 from travjax.simulation.robot import Robot
-from travjax.simulation.setup import Setup
-from travjax.simulation.tyre_tables import Places, TyreTable, tyre_table
+from travjax.simulation.tyre_tables import Places, TyreTable
 from travjax.traversal.arcs import (
     UNKNOWN_HEIGHT,
+    Lanes,
     Poses,
-    above_centre,
-    arc_maxima,
-    by_trajectory,
-    margins_from,
-    node_lanes,
     on_map,
-    pose_maxima,
-    view_lanes,
-    where_of,
+    read,
 )
 from travjax.traversal.steps import step_heights, without_gaps
 
 ROUNDS = 2
 """How often wheels are put on the ground: slopes follow from resting heights, and resting heights from slopes."""
-
-POSES_AT_ONCE = 50_000
-"""Poses times lanes that a CPU simulates at once; BUILD_NOTES.md has the measurement."""
-
-TURN_STEP = math.radians(5)
-"""Largest angle between poses of a point turn."""
 
 NODES_AT_ONCE = 8
 """Nodes of a tyre or an outline that are read in one step of a scan."""
@@ -108,111 +93,6 @@ def _scan_order(array: np.ndarray) -> np.ndarray:
     return array.reshape(chunks, poses, steps, each).transpose(0, 2, 1, 3)
 
 
-def tyre_margins(maps: jax.Array, setup: Setup, where: bool) -> tuple[Margins, Where | None]:
-    """Simulates every trajectory on a batch of maps [n, rows, cols]; `where` also finds where margins are reached."""
-    chunks, source = _arc_chunks(setup, len(maps))
-    turns = _turns(setup) if setup.contact.turn else None
-    return _simulate(maps, chunks, source, turns, setup.robot, setup.node_table().layout, where)
-
-
-@lru_cache(maxsize=8)
-def _arc_chunks(setup: Setup, maps: int) -> tuple[TyreChunks, jax.Array]:
-    """Puts the tables of all arcs for batches of `maps` maps, and the `source` of trajectories, on the device."""
-    table = setup.node_table()
-    arcs = table.poses.shape[0]
-    if jax.default_backend() == "cpu":
-        arcs = min(arcs, max(1, round(POSES_AT_ONCE / (maps * len(table.layout.views) * table.layout.poses))))
-    padding = table.poses[:1].repeat(-len(table.poses) % arcs, axis=0)
-    poses = np.concatenate([table.poses, padding])
-    with jax.ensure_compile_time_eval():  # gives arrays, not tracers, even when the caller is being traced
-        chunks = tyre_chunks(tyre_table(poses.reshape(-1, 3), setup.robot, setup.grid), len(poses) // arcs)
-        return chunks, jnp.asarray(table.source)
-
-
-@partial(jax.tree_util.register_dataclass, data_fields=["chunk", "passed", "left", "turn"], meta_fields=[])
-@dataclass(frozen=True)
-class _Turns:
-    """The poses of all point turns, which lie around the circle, in one chunk.
-
-    passed: [turns, N] which poses each turn passes through; left: [turns, N] how many poses are left from there to its
-            end; turn: [t] the turn of each trajectory
-    """
-
-    chunk: TyreChunks
-    passed: Bool[Array, "turns N"]
-    left: Int[Array, "turns N"]
-    turn: jax.Array
-
-
-@lru_cache(maxsize=8)
-def _turns(setup: Setup) -> _Turns:
-    """Puts the tables of the point turns on the device."""
-    headings, passed, left = turn_poses(setup.actions)
-    poses = np.stack([np.zeros_like(headings), np.zeros_like(headings), headings], axis=-1)
-    with jax.ensure_compile_time_eval():
-        chunk = jax.tree.map(lambda array: array[0], tyre_chunks(tyre_table(poses, setup.robot, setup.grid), 1))
-        turn = setup.actions.split(np.arange(len(setup.actions)))[0]
-        return _Turns(chunk, *map(jnp.asarray, (passed, left, turn)))
-
-
-def turn_poses(actions: ActionSpace) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Computes the headings of the poses of all point turns: [N] radians, evenly around the circle.
-
-    Also returns which of them each turn passes, and how many are left from there to its end: [turns, N] each. A turn
-    goes the shorter way round, the half circle anticlockwise.
-    """
-    parts = math.ceil(2 * math.pi / actions.turns / TURN_STEP - 1e-9)
-    count = actions.turns * parts
-    place, end = np.arange(count), np.arange(actions.turns)[:, None] * parts
-    anticlockwise = 2 * end <= count
-    passed = np.where(anticlockwise, place <= end, (place >= end) | (place == 0))
-    left = np.where(anticlockwise, end - place, np.where(place == 0, count, place) - end)
-    return 2 * math.pi * place / count, passed, left
-
-
-@partial(jax.jit, static_argnames=("robot", "layout", "where"))
-def _simulate(
-    maps, chunks: TyreChunks, source, turns: _Turns | None, robot: Robot, layout: Layout, where: bool
-) -> tuple[Margins, Where | None]:
-    grid, events = layout.grid, robot.events
-    heights = above_centre(maps, grid)
-    filled = without_gaps(heights, robot.wheel_diameter / 2, grid.spacing)
-    steps = step_heights(filled, robot.wheel_diameter / 2, grid.spacing)
-    filled = jnp.where(jnp.isnan(filled), UNKNOWN_HEIGHT, filled)
-    ground = Ground(*map(node_lanes, (heights, filled, steps)))
-    views = Ground(*(view_lanes(field, layout) for field in (ground.heights, ground.filled, ground.steps)))
-
-    def simulate_chunk(chunk: TyreChunks) -> tuple[jax.Array, jax.Array | None]:
-        return arc_maxima(settle(views, chunk, robot, layout, where), layout, events)
-
-    maxima, places = jax.lax.map(simulate_chunk, chunks)
-    maxima = by_trajectory(maxima, source, len(maps))
-    if places is not None:
-        places = jnp.stack([by_trajectory(places[:, part], source, len(maps)) for part in (0, 1)])
-    if turns is not None:
-        turning = settle(ground, turns.chunk, robot, Layout(grid, (View(),), 0, 0, 0), where)
-        maxima, places = _with_turns(maxima, places, turning, turns, events)
-    margins = margins_from(maxima, events)
-    return margins, None if places is None else where_of(places, margins.known, grid.nodes)
-
-
-def _with_turns(maxima, places, poses: Poses, turns: _Turns, events) -> tuple[jax.Array, jax.Array | None]:
-    """Puts the point turns of trajectories into maxima [E + 1, n, t] and places [2, E, n, t]."""
-    assert poses.step is not None
-    slopes = poses.pitch, poses.roll, poses.steepness
-    pose = Pose(tuple(poses.contact), (poses.step,), *slopes, poses.clearance, poses.nodes)
-    passed = jnp.where(turns.passed[..., None], pose_maxima([pose], events)[:, None], -UNKNOWN_HEIGHT)
-    turning = passed.max(axis=2)[:, turns.turn].transpose(0, 2, 1)
-    if places is not None:
-        at = passed[:-1].argmax(axis=2)  # [E, turns, n]
-        number = -jnp.take_along_axis(turns.left[None, ..., None], at[:, :, None], axis=2)[:, :, 0]
-        nodes = jnp.stack([event.node(pose) for event in events])
-        node = jnp.take_along_axis(nodes[:, None], at[:, :, None], axis=2)[:, :, 0]
-        turned = jnp.stack([number, node])[:, :, turns.turn].transpose(0, 1, 3, 2)
-        places = jnp.where(turning[:-1] > maxima[:-1], turned, places)
-    return larger(turning, maxima), places
-
-
 @dataclass(frozen=True)
 class Ground:
     """What the robot drives on, [nodes, lanes] metres each, above the map's centre and UNKNOWN_HEIGHT where unknown.
@@ -220,9 +100,19 @@ class Ground:
     filled: heights of steps.without_gaps; steps: of steps.step_heights
     """
 
-    heights: Float[Array, "nodes lanes"]
-    filled: Float[Array, "nodes lanes"]
-    steps: Float[Array, "nodes lanes"]
+    heights: Lanes
+    filled: Lanes
+    steps: Lanes
+
+
+def fields(heights: Float[Array, "n r c"], robot: Robot, spacing: float) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns the heights, filled heights and steps of maps, [n, rows, cols] metres each, UNKNOWN_HEIGHT where unknown.
+
+    heights: metres, UNKNOWN_HEIGHT where unknown
+    """
+    radius = robot.wheel_diameter / 2
+    filled = without_gaps(heights, radius, spacing)
+    return heights, jnp.where(jnp.isnan(filled), UNKNOWN_HEIGHT, filled), step_heights(filled, radius, spacing)
 
 
 def settle(
@@ -286,11 +176,11 @@ def settle(
     return Poses(contact, step, pitch, roll, pitch * pitch + rounded(roll * roll), clearance, nodes)
 
 
-def _under_wheels(heights: jax.Array, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
+def _under_wheels(heights: Lanes, chunk: TyreChunks, cols: int) -> tuple[jax.Array, jax.Array]:
     """Returns the ground under the wheels' centres, bilinear between nodes [N, 4, lanes], and its highest node."""
     x, y = chunk.within[..., :1], chunk.within[..., 1:]
     weights = ((1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y)
-    nodes = [_read(heights, chunk.corner + offset) for offset in (0, 1, cols, cols + 1)]
+    nodes = [read(heights, chunk.corner + offset) for offset in (0, 1, cols, cols + 1)]
     ground = sum(rounded(node * weight) for node, weight in zip(nodes, weights, strict=True))
     highest = nodes[0]
     for node in nodes[1:]:
@@ -298,7 +188,7 @@ def _under_wheels(heights: jax.Array, chunk: TyreChunks, cols: int) -> tuple[jax
     return jax.lax.optimization_barrier((ground, highest.max(axis=1)))
 
 
-def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: bool):
+def _on_tyres(heights: Lanes, steps: Lanes | None, east, north, chunk: TyreChunks, cols: int, where: bool):
     """Returns the height at which a plane through each pose's central node touches the tyres [N, 4, lanes], the largest
     step that they reach, and its node [N, lanes]; no step where `steps` is None, and no node unless `where`.
     """
@@ -310,9 +200,9 @@ def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: 
         for k in range(places.row.shape[-1]):
             node, plane = _plane_at(centre, east, north, places, k, cols)
             drop = places.height[:, k, None]
-            above = larger(_read(heights, node) - plane - drop, above)
+            above = larger(read(heights, node) - plane - drop, above)
             if steps is not None:
-                step = _read(steps, node)
+                step = read(steps, node)
                 step = jnp.where(step >= drop, step, 0)
                 at = jnp.where(step > reached, node[:, None], at) if where else at
                 reached = larger(step, reached)
@@ -328,7 +218,7 @@ def _on_tyres(heights, steps, east, north, chunk: TyreChunks, cols: int, where: 
     return jax.lax.optimization_barrier((above, reached.max(axis=1), at))
 
 
-def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int, where: bool):
+def _clearance(heights: Lanes, level, east, north, chunk: TyreChunks, cols: int, where: bool):
     """Returns the largest height of a node of the outline above the pose plane and what is allowed there, and the node
     in the view [N, lanes]; no node unless `where`.
     """
@@ -337,7 +227,7 @@ def _clearance(heights, level, east, north, chunk: TyreChunks, cols: int, where:
         highest, at = best
         for k in range(places.row.shape[-1]):
             node, plane = _plane_at(chunk.centre, east, north, places, k, cols)
-            above = _read(heights, node) - (level + plane) - places.height[:, k, None]
+            above = read(heights, node) - (level + plane) - places.height[:, k, None]
             at = jnp.where(above > highest, node[:, None], at) if where else at
             highest = larger(above, highest)
         return (highest, at), None
@@ -351,7 +241,3 @@ def _plane_at(centre, east, north, places: Scan, k: int, cols: int) -> tuple[jax
     row, col = places.row[:, k].astype(jnp.int32), places.col[:, k].astype(jnp.int32)
     plane = rounded(east * col[:, None].astype(jnp.float32)) + rounded(north * row[:, None].astype(jnp.float32))
     return centre + row * cols + col, plane
-
-
-def _read(lanes: jax.Array, nodes: jax.Array) -> jax.Array:
-    return lanes.at[nodes].get(mode="promise_in_bounds")

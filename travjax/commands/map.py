@@ -1,0 +1,70 @@
+"""`travjax map`: where a robot can drive on a whole site, and in which direction."""
+
+import argparse
+
+from travjax import options, progress
+from travjax.files import user_path
+from travjax.rasters.formats import OTHERS
+from travjax.signals import going_on
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser(
+        "map",
+        help="map where a robot can drive on a whole site, and in which direction",
+        description="Simulates the straight pass through every place of a site in every heading, and writes "
+        "GeoTIFFs of its cost and of what blocks it, and maps for Nav2. A site is an elevation map: GeoTIFF or another "
+        f"raster of local pixels that GDAL reads, {OTHERS}.",
+    )
+    parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
+    options.add_robot_alone(parser)
+    options.add_contact_model(parser, "tyre")
+    parser.add_argument(
+        "--method",
+        choices=("passes", "geometric"),
+        default="passes",
+        help="simulate passes, or compute the cost map of UNSTR-NAV, which has no headings, as a baseline (passes)",
+    )
+    parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
+    parser.add_argument("--stride", type=float, metavar="M", help="metres between places (0.25, or one coarse cell)")
+    parser.add_argument(
+        "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
+    )
+    options.add_reading(parser)
+    parser.add_argument(
+        "--grid-map", type=user_path, metavar="FILE", help="also write a GridMap of ROS 2 to this file, .mcap or .db3"
+    )
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS", help="simulate on a Dask cluster: the address of its scheduler, or local"
+    )
+    options.add_out(parser, "runs/map")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Maps the site and writes the results."""
+    from travjax.site.ground import SiteGround
+    from travjax.site.mapping import coarse_note, save_map, setup_of
+
+    passes = arguments.robot, arguments.headings, arguments.stride
+    nodes = 0.0625 if arguments.spacing is None else arguments.spacing
+    setup_of(*passes, nodes, arguments.contact)  # refuses what is wrong before the site is read
+    site = SiteGround.open(
+        arguments.site,
+        arguments.spacing,
+        reading=options.reading(arguments),
+        fill_holes=not arguments.keep_holes,
+        allow_coarse=arguments.allow_coarse,
+    )
+    setup = setup_of(*passes, site.spacing, arguments.contact)
+    for line in (*site.notes, coarse_note(site, setup.robot)):
+        if line:
+            progress.say(f"{arguments.site}: {line}")
+    if arguments.method == "geometric":
+        from travjax.site.geometric import save_geometric
+
+        save_geometric(site, setup, arguments.out)
+        return
+    with going_on("the same command goes on with the tiles that are missing"):
+        save_map(site, setup, arguments.out, arguments.grid_map, arguments.scheduler)

@@ -1,0 +1,166 @@
+"""grid_map_msgs/GridMap in recordings of ROS: ROS 1 .bag, ROS 2 .db3 and .mcap, read and written without ROS.
+
+Rows of a GridMap run along -x and its columns along -y, from the corner with the largest x and y; its layers may be
+circular buffers. Here, row 0 is the southernmost and column 0 the westernmost.
+"""
+
+import importlib.util
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from travjax.config import InputError, require
+from travjax.rasters.raster import InMetres, Raster, agreed_cell_size
+from travjax.rasters.reading_options import DemOptions
+
+TYPE = "grid_map_msgs/msg/GridMap"
+
+DEFINITIONS = {
+    "grid_map_msgs/msg/GridMapInfo": """float64 resolution
+float64 length_x
+float64 length_y
+geometry_msgs/Pose pose
+""",
+    TYPE: """std_msgs/Header header
+grid_map_msgs/GridMapInfo info
+string[] layers
+string[] basic_layers
+std_msgs/Float32MultiArray[] data
+uint16 outer_start_index
+uint16 inner_start_index
+""",
+}
+"""Of the messages as ROS 2 has them, for recordings that do not carry them."""
+
+TURNED = 1e-3
+"""Radians, the largest angle of a map's pose that counts as none."""
+
+
+def rosbags() -> ModuleType:
+    """Returns the package rosbags; raises InputError that says how to install it where it is missing."""
+    if importlib.util.find_spec("rosbags") is None:
+        raise InputError('rosbags: not installed; needed: pip install "travjax[ros]"')
+    import rosbags.highlevel
+    import rosbags.rosbag2
+    import rosbags.typesys
+
+    return rosbags
+
+
+def typestore() -> Any:
+    """Returns the message types of ROS 2, and those of grid_map."""
+    types = rosbags().typesys
+    store = types.get_typestore(types.Stores.ROS2_HUMBLE)
+    for name, text in DEFINITIONS.items():
+        store.register(types.get_types_from_msg(text, name))
+    return store
+
+
+def read_grid_map(path: Path, options: DemOptions) -> Raster:
+    """Reads a layer of a recorded GridMap: the latest message, or the latest until options.time.
+
+    Raises InputError when the recording is damaged or holds no GridMap, when topic or layer have to be chosen, and when
+    the map is turned.
+    """
+    engine = rosbags()
+    try:
+        with engine.highlevel.AnyReader([path], default_typestore=typestore()) as reader:
+            message = _message(reader, options)
+            return _raster(message, options)
+    except InputError:
+        raise
+    except Exception as error:  # rosbags raises whatever its parsers do
+        raise InputError(f"cannot be read as a recording of ROS: {str(error)[:160] or type(error).__name__}") from None
+
+
+def _message(reader: Any, options: DemOptions) -> Any:
+    """Returns the message to use."""
+    found = [one for one in reader.connections if one.msgtype == TYPE]
+    require(bool(found), "topics", sorted({one.msgtype for one in reader.connections}), f"some of type {TYPE}")
+    topics = sorted({one.topic for one in found})
+    if options.topic is None:
+        require(len(topics) == 1, "topic", topics, "chosen (--topic)")
+    else:
+        require(options.topic in topics, "topic", options.topic, " or ".join(topics))
+        found = [one for one in found if one.topic == options.topic]
+    until = math.inf if options.time is None else reader.start_time + 1e9 * options.time
+    latest = None
+    for connection, time, raw in reader.messages(connections=found):
+        if time <= until:
+            latest = connection, raw
+    require(
+        latest is not None, "time", options.time, "seconds from the start of the recording, at or after the first map"
+    )
+    assert latest is not None
+    return reader.deserialize(latest[1], latest[0].msgtype)
+
+
+def _raster(message: Any, options: DemOptions) -> Raster:
+    layers = list(message.layers)
+    if options.layer is None:
+        require(len(layers) == 1, "layer", layers, "chosen (--layer)")
+    else:
+        require(options.layer in layers, "layer", options.layer, " or ".join(layers))
+    info, index = message.info, layers.index(options.layer or layers[0])
+    turned = info.pose.orientation
+    angle = 2 * math.atan2(math.hypot(turned.x, turned.y, turned.z), abs(turned.w)) if turned.w or turned.z else 0.0
+    require(angle < TURNED, "pose, orientation", round(math.degrees(angle), 3), "0 degrees; turn the map first")
+    cell_size = agreed_cell_size(float(info.resolution), options.cell_size)
+    heights = _unrolled(message.data[index], message.outer_start_index, message.inner_start_index)[::-1, ::-1].T
+    rows, cols = heights.shape
+    centre = info.pose.position
+    origin = float(centre.x) - (cols - 1) / 2 * cell_size, float(centre.y) - (rows - 1) / 2 * cell_size
+    scale = 1.0 if options.height_scale is None else options.height_scale
+    notes = (f"frame {message.header.frame_id!r}" if hasattr(message, "header") else f"frame {info.header.frame_id!r}",)
+    return Raster(InMetres(np.ascontiguousarray(heights), scale, nodata=options.nodata), cell_size, origin, None, notes)
+
+
+def _unrolled(layer: Any, outer: int, inner: int) -> np.ndarray:
+    """Returns a layer [rows along -x, columns along -y] without the circular buffer's shifts."""
+    dims = {dim.label: int(dim.size) for dim in layer.layout.dim}
+    require(dims.keys() == {"column_index", "row_index"}, "layout", list(dims), "column_index and row_index")
+    rows, cols, values = dims["row_index"], dims["column_index"], np.asarray(layer.data, np.float32)
+    require(values.size == rows * cols, "data", values.size, f"{rows} x {cols} values")
+    by_column = layer.layout.dim[0].label == "column_index"
+    array = values.reshape(cols, rows).T if by_column else values.reshape(rows, cols)
+    return np.roll(array, (-int(outer), -int(inner)), axis=(0, 1))
+
+
+def write_grid_map(
+    path: Path, layers: Mapping[str, np.ndarray], cell_size: float, origin: tuple[float, float], frame: str = "map"
+) -> None:
+    """Writes layers [rows, cols] as one message on the topic /grid_map; path: a new file, .mcap or .db3.
+
+    origin: x, y of the south-west cell's middle, metres
+    """
+    engine, types = rosbags(), typestore()
+    kinds, plugins = types.types, engine.rosbag2.StoragePlugin
+    rows, cols = next(iter(layers.values())).shape
+    stamp = kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
+    x, y = origin[0] + (cols - 1) / 2 * cell_size, origin[1] + (rows - 1) / 2 * cell_size
+    pose = kinds["geometry_msgs/msg/Pose"](
+        position=kinds["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
+        orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+    )
+    info = kinds["grid_map_msgs/msg/GridMapInfo"](
+        resolution=cell_size, length_x=cols * cell_size, length_y=rows * cell_size, pose=pose
+    )
+    dimension = kinds["std_msgs/msg/MultiArrayDimension"]
+    dims = [dimension("column_index", rows, rows * cols), dimension("row_index", cols, cols)]
+    layout = kinds["std_msgs/msg/MultiArrayLayout"](dim=dims, data_offset=0)
+    data = [
+        kinds["std_msgs/msg/Float32MultiArray"](layout, np.ascontiguousarray(layer[::-1, ::-1], np.float32).ravel())
+        for layer in layers.values()
+    ]
+    message = kinds[TYPE](header, info, list(layers), [], data, 0, 0)
+    folder = path.with_name(f"{path.name}.bag")
+    plugin = plugins.SQLITE3 if path.suffix == ".db3" else plugins.MCAP
+    with engine.rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/grid_map", TYPE, typestore=types)
+        writer.write(connection, 0, types.serialize_cdr(message, TYPE))
+    next(file for file in folder.iterdir() if file.suffix == path.suffix).rename(path)

@@ -1,0 +1,222 @@
+"""Maps of whole sites: simulated tile by tile, and written for GIS and navigation (SPEC section 13)."""
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from travjax import progress
+from travjax.config import require, require_length, to_json
+from travjax.evaluation import map_figures
+from travjax.evaluation.tables import rows_table
+from travjax.files import atomic_write, held, output_folder, save_text
+from travjax.memory import require_memory
+from travjax.rasters.grid_maps import rosbags, write_grid_map
+from travjax.simulation.heights import as_site
+from travjax.simulation.robot import Robot
+from travjax.simulation.setup import chosen_robot
+from travjax.site import site_figures
+from travjax.site.costs import UNKNOWN_COST, band_names
+from travjax.site.geotiff import Frame, rasterio, save_geotiff
+from travjax.site.ground import ArrayGround, SiteGround
+from travjax.site.kernel import SiteSetup, tiles_of
+from travjax.site.nav2 import over_headings, save_nav2
+from travjax.site.primitives import straight_passes
+from travjax.site.store import Store
+from travjax.site.tiling import executor, parts_of
+
+COARSE = 0.125
+"""Metres: with larger cells a line says what the events still mean."""
+
+
+@dataclass(frozen=True, eq=False)
+class SiteMap:
+    """What a map says of the places of a site; rows run north, columns east.
+
+    bands:    by the names of costs.band_names, [rows, cols] float32 each: counts of headings, costs 0 to 100, margins
+              as shares of their limits, and the number of the blocking event, 0 for none; NaN where unknown
+    costs:    [headings, rows, cols] 0 to 100, 255 where unknown
+    heights:  [rows, cols] metres, of the ground at the places
+    headings: radians, anticlockwise from +y; x, y: metres, of the columns and rows; crs: None for none
+    """
+
+    bands: Mapping[str, Float[np.ndarray, "rows cols"]]
+    costs: UInt8[np.ndarray, "h rows cols"]
+    heights: Float[np.ndarray, "rows cols"]
+    headings: Float[np.ndarray, " h"]
+    x: Float[np.ndarray, " cols"]
+    y: Float[np.ndarray, " rows"]
+    crs: str | None
+
+    def shares(self) -> dict[str, float]:
+        """Returns the shares of places that are passable in every known direction, in some, in none, and unknown."""
+        return _shares(self.bands["passable_headings"], self.bands["known_headings"])
+
+    def to_xarray(self):
+        """Returns an xarray.Dataset with the bands, `cost` and `elevation`; xarray has to be installed."""
+        import xarray
+
+        values: dict[str, tuple] = {name: (("y", "x"), band) for name, band in self.bands.items()}
+        values |= {"cost": (("heading", "y", "x"), self.costs), "elevation": (("y", "x"), self.heights)}
+        coordinates = {"x": self.x, "y": self.y, "heading": np.degrees(self.headings)}
+        return xarray.Dataset(values, coordinates, {"crs": self.crs or ""})
+
+
+def setup_of(
+    robot: Robot | str | None,
+    headings: int = 16,
+    stride: float | None = None,
+    spacing: float = 0.0625,
+    contact: str | None = None,
+) -> SiteSetup:
+    """Returns the setup of a map: a straight pass in each heading.
+
+    stride: metres between places; 0.25 m or one node unless given; contact: "tyre" unless given here or by the robot
+    Raises InputError that names argument, value and what is allowed.
+    """
+    chosen, places = chosen_robot(robot), max(0.25, spacing) if stride is None else stride
+    require_length("stride", places, 0.001, 1000)
+    model = contact or chosen.contact or "tyre"
+    return SiteSetup(chosen, straight_passes(headings, places), spacing, places, contact=model)
+
+
+def map_site(
+    site: str | Path | SiteGround | Float[np.ndarray, "rows cols"],
+    robot: Robot | str | None = None,
+    *,
+    headings: int = 16,
+    stride: float | None = None,
+    spacing: float | None = None,
+    contact: str | None = None,
+) -> SiteMap:
+    """Maps where a robot can drive on a whole site, and in which direction.
+
+    site:     an elevation map that `load_dem` reads, a `SiteGround`, or heights [rows, cols] in metres, row 0 south
+    robot:    a Robot, or the name or file of one; the Seekur Jr unless given
+    headings: number of headings, evenly around the circle; stride: metres between places (0.25); spacing: metres
+              between nodes (0.0625)
+    contact:  contact model, "tyre" or "nearest"; that of the robot's file unless given, or else "tyre"
+    Source: SPEC section 13. Raises InputError as `SiteGround.open` and `simulate_site` do.
+    """
+    ground: SiteGround | ArrayGround
+    if isinstance(site, str | Path):
+        ground = SiteGround.open(site, spacing)
+    else:
+        ground = site if isinstance(site, SiteGround) else ArrayGround(as_site(site))
+    nodes = ground.spacing if isinstance(ground, SiteGround) else 0.0625 if spacing is None else spacing
+    setup = setup_of(robot, headings, stride, nodes, contact)
+    names, lattice = band_names(setup.robot), setup.lattice(ground.shape)
+    bands = np.full((len(names), *lattice), np.nan, np.float32)
+    costs = np.full((headings, *lattice), UNKNOWN_COST, np.uint8)
+    heights = np.full(lattice, np.nan, np.float32)
+    with executor() as pool:
+        for _, part in parts_of(ground, setup, pool):
+            place = ..., *part.tile.within(lattice)
+            bands[place], costs[place], heights[place] = part.bands, part.costs, part.heights
+    origin = ground.origin if isinstance(ground, SiteGround) else (0.0, 0.0)
+    x, y = (start + setup.stride * np.arange(count) for start, count in zip(origin, lattice[::-1], strict=True))
+    angles = 2 * np.pi * np.arange(headings) / headings
+    crs = ground.crs if isinstance(ground, SiteGround) else None
+    return SiteMap(dict(zip(names, bands, strict=True)), costs, heights, angles, x, y, crs)
+
+
+def save_map(
+    site: SiteGround,
+    setup: SiteSetup,
+    out: str | Path,
+    grid_map: Path | None = None,
+    scheduler: str | None = None,
+) -> Path:
+    """Maps a site and writes map.tif, headings.tif, the maps for Nav2, figures and shares; returns the folder.
+
+    Memory does not grow with the site; a run that was stopped goes on with the tiles that are missing.
+    grid_map:  file of ROS 2, .mcap or .db3, that gets the bands and the elevation as layers of a GridMap
+    scheduler: of a Dask cluster that simulates the tiles, as of tiling.executor
+    Raises InputError when rasterio is missing, or rosbags for a GridMap, or when something cannot be read or written.
+    """
+    rasterio()
+    if grid_map is not None:
+        rosbags()
+        require(grid_map.suffix in (".mcap", ".db3"), "--grid-map", str(grid_map), "a name that ends in .mcap or .db3")
+    with executor(scheduler) as pool, held(folder := output_folder(out)):
+        store = _simulated(site, setup, folder, pool)
+        written = _written(store, site, setup, folder)
+        if grid_map is not None:
+            written.append(_save_grid_map(grid_map, store, site, setup))
+        store.remove()
+    progress.wrote(*written)
+    return folder
+
+
+def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Executor, int]) -> Store:
+    lattice, names = setup.lattice(site.shape), band_names(setup.robot)
+    tiles = tiles_of(lattice)
+    settings = {"site": site.sha256, "reading": site.reading, "setup": to_json(setup), "travjax": version("travjax")}
+    store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
+    with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:
+        for number, part in parts_of(site, setup, pool, set(np.flatnonzero(store.done).tolist())):
+            store.add(number, part)
+            bar.update()
+    return store
+
+
+def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> list[Path]:
+    frame, names = Frame(site.origin, setup.stride, site.crs), band_names(setup.robot)
+    degrees = [np.degrees(primitive.heading) for primitive in setup.primitives]
+    events = ", ".join(f"{code} {name}" for code, name in enumerate(("none", *setup.robot.event_names)))
+    tags = {
+        "robot": setup.robot.name,
+        "contact": setup.contact,
+        "site": Path(site.path).name,
+        "site_sha256": site.sha256,
+        "blocking_event": events,
+    }
+    bands = dict(zip(names, store.bands, strict=True))
+    shares = _shares(bands["passable_headings"], bands["known_headings"])
+    table = rows_table([{"passable in": name, "share of places": f"{share:.1%}"} for name, share in shares.items()])
+    heading = f"{setup.robot.name}, {setup.contact}, {len(degrees)} headings, {setup.stride:g} m apart"
+    progress.say(f"{heading}\n{table}\n")
+    what = heading, Path(site.path).name
+    layers = [f"heading {angle:g} deg" for angle in degrees]
+    passable = site_figures.passable_figure(store.heights, bands, store.costs, frame, what)
+    blocking = site_figures.blocking_figure(store.heights, bands, frame, setup.robot.event_names, what)
+    return [
+        save_geotiff(folder / "map.tif", store.bands, names, frame, float("nan"), tags),
+        save_geotiff(folder / "headings.tif", store.costs, layers, frame, UNKNOWN_COST, tags),
+        *save_nav2(folder / "nav2", over_headings(store.costs), frame),
+        map_figures.save(passable, folder / "map.png"),
+        map_figures.save(blocking, folder / "why.png"),
+        save_text(folder / "shares.txt", f"{heading}\n{table}\n"),
+    ]
+
+
+def _save_grid_map(path: Path, store: Store, site: SiteGround, setup: SiteSetup) -> Path:
+    require_memory(4 * store.bands.nbytes, f"{path}: {store.bands.nbytes} bytes of layers", "; leave --grid-map out")
+    layers = dict(zip(band_names(setup.robot), store.bands[:, ::-1], strict=True)) | {"elevation": store.heights[::-1]}
+    with atomic_write(path) as temporary:
+        write_grid_map(temporary, layers, setup.stride, site.origin)
+    return path
+
+
+def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
+    counts = np.zeros(4)
+    for top in range(0, len(known), 512):
+        ways, seen = passable[top : top + 512], known[top : top + 512]
+        every, some, unknown = (ways == seen) & (seen > 0), (ways > 0) & (ways < seen), seen == 0
+        counts += [every.sum(), some.sum(), (ways == 0).sum(), unknown.sum()]
+    names = ("every direction", "some directions", "no direction", "unknown")
+    return dict(zip(names, (counts / known.size).tolist(), strict=True))
+
+
+def coarse_note(site: SiteGround, robot: Robot) -> str | None:
+    """Returns a line about what the events mean on a site whose cells are coarse; None where they are not."""
+    if site.cell_size <= COARSE:
+        return None
+    return (
+        f"cells of {site.cell_size:g} m: tilt is that of ground averaged over {site.cell_size:g} m (wheelbase "
+        f"{robot.wheelbase:g} m); steps and obstacles narrower than two cells are not seen"
+    )
