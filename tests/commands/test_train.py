@@ -38,19 +38,29 @@ pytestmark = pytest.mark.usefixtures("shared_code")
 FEW_STEPS = TOML.replace("head_epochs = 2", "head_epochs = 1").replace("\nepochs = 2", "\nepochs = 1")
 FEW_STEPS = FEW_STEPS.replace("1e-3", "3e-5")  # RMSprop makes much of the last digits of small gradients
 
-KILLED = """
-import os, signal, sys
+STOPPED = """
+import os, signal, sys, time
 from travjax import cli
 from travjax.training.trainer import Trainer
 step, total = Trainer._step, int(sys.argv[1])
 
-def killed(self, *batch):
+def stopped(self, *batch):
     if self.position.total == total:
-        os.kill(os.getpid(), signal.SIGKILL)
+        {stop}
     return step(self, *batch)
 
-Trainer._step = killed
-cli.main(sys.argv[2:])
+Trainer._step = stopped
+sys.exit(cli.main(sys.argv[2:]))
+"""
+KILLED = STOPPED.format(stop="os.kill(os.getpid(), signal.SIGKILL)")
+HELD = STOPPED.format(stop="time.sleep(600)")
+
+TWO_COMMANDS = """
+import sys
+from travjax import cli
+then = sys.argv.index("then")
+assert cli.main(sys.argv[1:then]) == 2
+sys.exit(cli.main(sys.argv[then + 1 :]))
 """
 
 
@@ -155,11 +165,27 @@ def test_the_folder_is_named_after_the_preset(tmp_path, monkeypatch, words):
 # ---- Going on
 
 
-def test_a_run_that_was_killed_in_both_phases_ends_like_one_that_was_not(trained, tmp_path, words):
+def test_a_run_that_was_interrupted_and_killed_ends_like_one_that_was_not_and_its_folder_is_its_own(
+    trained, tmp_path, words
+):
     words = (*words, "--out", tmp_path / "run")
-    finished(program((5, *words), script=KILLED), code=-signal.SIGKILL)
-    rows = rows_of(tmp_path / "run")
-    assert rows and rows == rows_of(trained)[: len(rows)] and rows[-1]["step"] == 5
+    first, log = program((5, *words), script=HELD), tmp_path / "run/metrics.jsonl"
+    try:
+        while not (log.exists() and '"step": 5' in log.read_text()):
+            assert first.poll() is None
+            time.sleep(0.01)
+        rows = rows_of(tmp_path / "run")
+        assert re.fullmatch(
+            f"--out {tmp_path}/run: in use by process {first.pid} on .+; allowed: a folder that no other run uses",
+            refusal((*words, "--resume")),
+        )
+        assert rows and rows == rows_of(tmp_path / "run") == rows_of(trained)[: len(rows)]
+        first.send_signal(signal.SIGINT)
+        _, err = first.communicate(timeout=100)
+    finally:
+        first.kill()
+    assert first.returncode == 130, err
+    assert err == "travjax: interrupted; with --resume the same command goes on from the latest checkpoint\n"
     finished(program((26, *words, "--resume"), script=KILLED), code=-signal.SIGKILL)
     assert {row["phase"] for row in rows_of(tmp_path / "run")} == {1, 2}
     train((*words, "--resume"))
@@ -218,8 +244,13 @@ def require_close(folder, other):
             assert a[name] == pytest.approx(b[name], rel=1e-4), (name, a["step"])
 
 
-def test_four_devices_train_like_one(alone, tmp_path):
-    finished(program((*alone[0], "--out", tmp_path / "run"), devices=4))
+def test_four_devices_train_like_one_and_refuse_a_batch_that_they_cannot_share(alone, tmp_path):
+    words, six = alone[0], tmp_path / "six.toml"
+    six.write_text(FEW_STEPS.replace("batch_size = 8", "batch_size = 6"))
+    refused = (words[0], six, *words[2:], "--out", tmp_path / "refused")
+    both = (*refused, "then", *words, "--out", tmp_path / "run")
+    ((_, err),) = finished(program(both, script=TWO_COMMANDS, devices=4))
+    assert "travjax: batch_size = 6: must be a multiple of the 4 devices that share a batch" in err.splitlines()
     require_close(tmp_path / "run", alone[1])
 
 
@@ -235,29 +266,6 @@ def test_two_processes_train_like_one_device_and_go_on_together(alone, tmp_path)
     one, two = saved_state(tmp_path / "run"), saved_state(alone[1])
     assert one.keys() == two.keys()
     train((*alone[0], "--out", tmp_path / "run", "--resume"))  # on one device
-
-
-def test_a_folder_in_use_is_refused_at_once_and_an_interruption_says_how_it_goes_on(trained, tmp_path, words):
-    words = (*words, "--out", tmp_path / "run")
-    first = program(words)
-    try:
-        while not any((tmp_path / "run/checkpoints").glob("0*")):
-            assert first.poll() is None
-            time.sleep(0.01)
-        before = rows_of(tmp_path / "run")
-        assert re.fullmatch(
-            f"--out {tmp_path}/run: in use by process {first.pid} on .+; allowed: a folder that no other run uses",
-            refusal((*words, "--resume")),
-        )
-        assert rows_of(tmp_path / "run")[: len(before)] == before
-        first.send_signal(signal.SIGINT)
-        out, err = first.communicate(timeout=100)
-    finally:
-        first.kill()
-    assert first.returncode == 130, err
-    assert err == "travjax: interrupted; with --resume the same command goes on from the latest checkpoint\n"
-    train((*words, "--resume"))
-    assert rows_of(tmp_path / "run") == rows_of(trained)
 
 
 # ---- Bad input; each is found before training
@@ -369,11 +377,6 @@ def test_a_damaged_data_set_is_one_line(tmp_path, words):
 def test_options_that_do_not_fit_together_are_one_line(tmp_path, words, more, message):
     assert refusal((*words, "--out", tmp_path / "run", *more)).startswith(message)
     assert files(tmp_path) == set()
-
-
-def test_a_batch_that_the_devices_cannot_share_is_one_line(tmp_path, words):
-    ((_, err),) = finished(program((*words, "--out", tmp_path / "run"), devices=3), code=2)
-    assert err.splitlines()[-1] == "travjax: batch_size = 8: must be a multiple of the 3 devices that share a batch"
 
 
 def test_a_data_set_in_the_folder_that_was_made_from_something_else_is_not_trained_on(words, tmp_path):

@@ -117,13 +117,13 @@ def test_a_resnet_is_loaded_from_its_run(trained):
 
 
 def test_probabilities_and_margins_are_the_network_s(tiny):
-    heights = dataset().heights[:6]
+    heights = dataset().heights[:9]
     found = tiny.predict(heights)
     source = MapSource.from_maps(heights, SETUP, RUN.preset.elevation_scale)
-    hazards = np.asarray(map_hazards(*split_model(tiny.network), source, np.arange(6)), np.float64)
+    hazards = np.asarray(map_hazards(*split_model(tiny.network), source, np.arange(9)), np.float64)
     np.testing.assert_allclose(found.probability, 1 / (1 + np.exp(-hazards[..., :3])), atol=1e-6)
     np.testing.assert_allclose(found.margins, hazards[..., 3:] * HUSKY.limits, atol=1e-5)
-    assert found.probability.shape == found.margins.shape == (6, len(FEW), 3)
+    assert found.probability.shape == found.margins.shape == (9, len(FEW), 3)
     assert found.probability.std(axis=(0, 1)).min() > 1e-4
     assert not isinstance(found.probability, jax.Array) and not isinstance(found.margins, jax.Array)
 
@@ -186,7 +186,7 @@ def test_where_an_estimator_comes_from_is_kept(field, tiny):
 
 
 def test_a_site_at_2000_m_loses_nothing(tiny):
-    heights = dataset().heights[:3].astype(np.float64)
+    heights = dataset().heights[:2].astype(np.float64)
     low, high = (tiny.predict(heights + offset) for offset in (0, 2000))
     np.testing.assert_allclose(high.probability, low.probability, atol=1e-5)
     np.testing.assert_allclose(high.margins, low.margins, atol=1e-4)
@@ -290,4 +290,4 @@ def test_the_packaged_estimator_is_right_on_fresh_maps(packaged):
     near = margins < 2 * limits
     error = [np.abs(found.margins - margins)[..., event][near[..., event]].mean() for event in range(3)]
     assert (error < 0.15 * limits).all()
-    np.testing.assert_allclose(travjax.predict(heights[:4]), found.probability[:4], atol=1e-6)
+    np.testing.assert_allclose(travjax.predict(heights), found.probability, atol=1e-6)
