@@ -4,7 +4,7 @@ Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest
 
 Compiled code is kept in a folder that is new for each session and shared by its processes: most of the tests' time is
 XLA's, and it compiles many programs several times. XLA optimises as it does for users: BUILD_NOTES.md (failed trials:
-tests) says what less of it would save.
+commands and what programs share) says what less of it would save.
 """
 
 import gc
@@ -49,7 +49,14 @@ LONGEST = [
     *("simulation/test_events.py", "commands/test_evaluate.py", "resnet/test_imagenet_weights.py"),
     *("resnet/test_convolution.py", "physics/test_physics.py", "terrain/test_styles.py", "commands/test_predict.py"),
     *("estimators/test_map_estimator.py", "runs/test_checkpoint.py", "test_wheel.py", "resnet/test_network.py"),
-    *("evaluation/test_map_figures.py", "models/test_input_images.py", "test_examples.py", "test_docs.py"),
+    *(
+        "site/test_kernel.py",
+        "site/test_mapping.py",
+        "evaluation/test_map_figures.py",
+        "models/test_input_images.py",
+        "test_examples.py",
+        "test_docs.py",
+    ),
 ]
 """Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
 
