@@ -1,7 +1,9 @@
 """The site kernel: equal to the sequential simulators, the same whatever the tiles, unknown beyond the edge."""
 
 import math
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
 from travjax.simulation.robot import Robot
 from travjax.site import kernel
+from travjax.site.ground import SiteGround
 from travjax.site.kernel import SiteSetup, simulate_site, tiles_of
 from travjax.site.primitives import Primitive, straight_passes
 from travjax.terrain.styles import generate_terrain
@@ -78,6 +81,16 @@ def compare(heights, robot: Robot, primitives, contact: str, stride: float, spac
 )
 def test_margins_are_those_of_the_sequential_simulators(ground, contact, robot, primitives, stride, spacing):
     assert 0.2 < compare(ground, robot, primitives, contact, stride, spacing, count=60) < 1
+
+
+@pytest.mark.parametrize("contact", ["nearest", "tyre"])
+@pytest.mark.parametrize("name", ["quarry", "mars_live_site"])
+def test_margins_on_real_sites_are_those_of_the_sequential_simulators(name, contact):
+    path = Path(os.environ.get("TRAVJAX_DATA", "")) / f"terrain/{name}.tif"
+    if not path.is_file():
+        pytest.skip(f"needs {name}.tif under TRAVJAX_DATA")
+    part = SiteGround.open(path).part(slice(100, 400), slice(60, 360))
+    assert compare(part, SEEKUR_JR, straight_passes(16), contact, 0.25, 0.0625, count=30) > 0.2
 
 
 @pytest.mark.parametrize("contact", ["nearest", "tyre"])

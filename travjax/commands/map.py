@@ -6,6 +6,7 @@ from travjax import options, progress
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 from travjax.signals import going_on
+from travjax.simulation.contact import spacing_note
 
 
 def add(commands: options.Commands) -> None:
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
         allow_coarse=arguments.allow_coarse,
     )
     setup = setup_of(*passes, site.spacing, arguments.contact)
-    for line in (*site.notes, coarse_note(site, setup.robot)):
+    for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
         if line:
             progress.say(f"{arguments.site}: {line}")
     if arguments.method == "geometric":

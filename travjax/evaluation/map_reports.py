@@ -10,6 +10,7 @@ from travjax.data.map_batches import Batch, MapStream, bytes_each, joined, label
 from travjax.evaluation import tables
 from travjax.files import output_folder, save_npz, save_text
 from travjax.npz_stream import NpzStream
+from travjax.simulation.contact import spacing_note
 from travjax.simulation.grid import Grid
 from travjax.simulation.setup import Setup
 
@@ -50,6 +51,8 @@ def label_maps(maps: MapStream, setup: Setup, out: str | Path, figures: bool = T
     Returns the path of the .npz of the labels. Raises InputError when they do not fit on the disk or cannot be written.
     """
     folder, robot = output_folder(out), setup.robot
+    if note := spacing_note(setup.contact.model, setup.grid.spacing):
+        progress.say(note)
     config = setup.to_json_text(files=maps.files, world=maps.world)
     with NpzStream(folder / "labels.npz", maps.total, bytes_each(setup, where=True), "labelled maps") as labels:
         for batch in _counted((labelled(one, setup, where=True) for one in maps.batches), maps.total, "labelling"):
