@@ -40,7 +40,7 @@ def test_costs_are_those_of_the_formulas():
     heights[60, 70] = np.nan
     setup = setup_of(ROBOT, 1, 0.25)
     lattice = setup.lattice(heights.shape)
-    (tile,) = tiles_of(lattice)
+    (tile,) = tiles_of(lattice, setup)
     ground = ArrayGround(heights.astype(np.float32)).part(*tile.ground(setup))
     found = np.asarray(geometric_tile(ground, setup))[:, : lattice[0], : lattice[1]]
     reach = math.hypot(ROBOT.overall_length, ROBOT.overall_width) / 2

@@ -104,11 +104,18 @@ def test_bits_do_not_depend_on_the_tiles(ground, contact, monkeypatch):
 
 
 def test_tiles_cover_a_lattice_once():
+    setup = SiteSetup(SEEKUR_JR, straight_passes(4))
     for lattice in ((1, 1), (8, 9), (300, 130), (129, 128)):
         covered = np.zeros(lattice, int)
-        for tile in tiles_of(lattice):
+        for tile in tiles_of(lattice, setup):
             covered[tile.within(lattice)] += 1
         assert (covered == 1).all()
+
+
+def test_a_tile_of_fine_nodes_has_fewer_places():
+    setup = SiteSetup(SEEKUR_JR, straight_passes(4, 1.0), 0.01, 1.0)
+    tile = tiles_of((1000, 1000), setup)[0]
+    assert tile.edge == 32 and tile.ground(setup)[0].stop - tile.ground(setup)[0].start <= kernel.TILE_NODES
 
 
 @pytest.mark.parametrize("contact", ["nearest", "tyre"])
@@ -154,6 +161,10 @@ def test_high_ground_loses_nothing(ground):
         ({"stride": 0.1}, "stride = 0.1: must be a whole number of nodes, 0.0625 m each"),
         ({"contact": "soft"}, "contact = 'soft': must be"),
         ({"interval": 0}, "interval = 0: must be"),
+        (
+            {"spacing": 0.002},
+            "spacing = 0.002: must be at least 0.0034 m, at which Seekur Jr with its passes spans 512 nodes",
+        ),
         ({"primitives": ()}, r"primitives = \(\): must be at least one"),
     ],
 )

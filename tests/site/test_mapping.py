@@ -201,7 +201,8 @@ def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_pa
     monkeypatch.setattr(mapping, "parts_of", lambda *of: stopping(*of, after=-1))
     save_map(site, setup, tmp_path)
     assert (
-        simulated == list(range(len(kernel.tiles_of(setup.lattice(site.shape))))) and not (tmp_path / FOLDER).exists()
+        simulated == list(range(len(kernel.tiles_of(setup.lattice(site.shape), setup))))
+        and not (tmp_path / FOLDER).exists()
     )
     with rasterio.open(tmp_path / "map.tif") as one, rasterio.open(mapped[0] / "map.tif") as other:
         np.testing.assert_array_equal(one.read(), other.read())

@@ -93,8 +93,8 @@ def save_geometric(site: SiteGround, setup: SiteSetup, out: str | Path) -> Path:
     rasterio()
     folder, lattice = output_folder(out), setup.lattice(site.shape)
     bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
-    with progress.bar("mapping", len(tiles_of(lattice)), "tile") as bar:
-        for tile in tiles_of(lattice):
+    with progress.bar("mapping", len(tiles_of(lattice, setup)), "tile") as bar:
+        for tile in tiles_of(lattice, setup):
             rows, cols = tile.within(lattice)
             found = np.asarray(geometric_tile(site.part(*tile.ground(setup)), setup))
             bands[:, rows, cols] = found[:, : rows.stop - rows.start, : cols.stop - cols.start]

@@ -38,6 +38,12 @@ from travjax.traversal.tyre import Ground, TyreChunks, fields, settle, tyre_chun
 TILE = 128
 """Places along an edge of a tile, at most."""
 
+TILE_NODES = 4096
+"""Nodes along an edge of a tile with what is around it, about, at most."""
+
+WIDEST = 512
+"""Nodes that the robot with its poses may span: tables grow with the square."""
+
 
 @dataclass(frozen=True)
 class SiteSetup:
@@ -64,6 +70,9 @@ class SiteSetup:
         ratio = self.stride / self.spacing
         whole = self.stride > 0 and round(ratio) >= 1 and abs(ratio - round(ratio)) < 1e-6
         require(whole, "stride", self.stride, f"a whole number of nodes, {self.spacing:g} m each")
+        finest = self._reach / (WIDEST // 2 - 2)
+        allowed = f"at least {finest:.2g} m, at which {self.robot.name} with its passes spans {WIDEST} nodes"
+        require(self.spacing >= finest, "spacing", self.spacing, allowed)
 
     @property
     def step(self) -> int:
@@ -73,14 +82,18 @@ class SiteSetup:
     @property
     def grid(self) -> Grid:
         """A grid around a place that holds all poses."""
+        half = math.ceil(self._reach / self.spacing) + 2
+        return Grid(2 * half * self.spacing, self.spacing)
+
+    @property
+    def _reach(self) -> float:
+        """Metres from a place to the farthest point of the robot."""
         robot, poses = self.robot, all_poses(self.primitives, self.interval)
         outline = math.hypot(
             max(robot.overall_width, robot.track + robot.wheel_width, robot.chassis_width),
             max(robot.overall_length, robot.wheelbase + robot.wheel_diameter, robot.chassis_length),
         )
-        reach = float(np.hypot(poses[..., 0], poses[..., 1]).max()) + outline / 2
-        half = math.ceil(reach / self.spacing) + 2
-        return Grid(2 * half * self.spacing, self.spacing)
+        return float(np.hypot(poses[..., 0], poses[..., 1]).max()) + outline / 2
 
     @property
     def halo(self) -> int:
@@ -116,9 +129,10 @@ class Tile:
         return slice(starts[0], starts[0] + count), slice(starts[1], starts[1] + count)
 
 
-def tiles_of(lattice: tuple[int, int]) -> list[Tile]:
+def tiles_of(lattice: tuple[int, int], setup: SiteSetup) -> list[Tile]:
     """Covers a lattice of (rows, columns) with tiles of one size, row by row from the south-west."""
-    edge = min(TILE, max(8, 1 << (max(lattice) - 1).bit_length()))
+    fitting = max(TILE_NODES // setup.step - 2 * setup.halo, 1)
+    edge = min(TILE, max(8, 1 << (max(lattice) - 1).bit_length()), 1 << (fitting.bit_length() - 1))
     return [Tile(row, col, edge) for row in range(0, lattice[0], edge) for col in range(0, lattice[1], edge)]
 
 
@@ -152,7 +166,7 @@ def simulate_site(
     lattice = setup.lattice(ground.shape)
     found = [np.full((len(passes), *lattice), np.nan, np.float32) for _ in chosen.events]
     known = np.zeros((len(passes), *lattice), bool)
-    tiles = tiles_of(lattice)
+    tiles = tiles_of(lattice, setup)
     with ThreadPoolExecutor(workers()) as pool:
         simulated = pool.map(lambda tile: tile_margins(ground.part(*tile.ground(setup)), setup), tiles)
         for tile, margins in zip(tiles, simulated, strict=True):

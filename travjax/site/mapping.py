@@ -154,7 +154,7 @@ def save_map(
 
 def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Executor, int]) -> Store:
     lattice, names = setup.lattice(site.shape), band_names(setup.robot)
-    tiles = tiles_of(lattice)
+    tiles = tiles_of(lattice, setup)
     settings = {"site": site.sha256, "reading": site.reading, "setup": to_json(setup), "travjax": version("travjax")}
     store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
     with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:

@@ -60,7 +60,7 @@ def _row(site: SiteGround, robot: str, contact: str) -> dict:
     setup, ground = setup_of(robot, spacing=site.spacing, contact=contact), _Timed(site)
     lattice = setup.lattice(site.shape)
     start = time.perf_counter()
-    with executor() as pool, progress.bar(contact, len(tiles_of(lattice)), "tile") as bar:
+    with executor() as pool, progress.bar(contact, len(tiles_of(lattice, setup)), "tile") as bar:
         for _ in parts_of(ground, setup, pool):
             bar.update()
     seconds = time.perf_counter() - start

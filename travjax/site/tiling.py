@@ -82,7 +82,7 @@ def parts_of(
 ) -> Iterator[tuple[int, Part]]:
     """Yields the number of each tile and its part, in order, except those that are done; pool: of `executor`."""
     lattice, (simulating, count) = setup.lattice(ground.shape), pool
-    tiles = [(number, tile) for number, tile in enumerate(tiles_of(lattice)) if number not in done]
+    tiles = [(number, tile) for number, tile in enumerate(tiles_of(lattice, setup)) if number not in done]
     running: deque[tuple[int, Future]] = deque()
     for number, tile in tiles:
         running.append((number, simulating.submit(_part, ground.part(*tile.ground(setup)), tile, setup, lattice)))
