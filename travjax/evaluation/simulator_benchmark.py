@@ -42,6 +42,7 @@ COLUMNS = {
 }
 
 BATCHES = (1, 8, 32, 128)
+LABELLING = {"nearest": "labelling", "tyre": "labelling, tyre"}
 STREAM_CHUNK = 320
 SEQUENTIAL = "sequential NumPy simulator"
 
@@ -94,7 +95,7 @@ def measure(setup: Setup, out: str | Path, repeats: int = 15, stream: int = 0) -
             rows.append(stream_row(stream, setup, bar.update))
     rows = with_speed_up(rows)
     write_rows(rows, COLUMNS, folder / "bench.tsv")
-    kernels = [row for row in rows if row["what"].startswith(("terrain", "labelling")) and row["repeats"] > 1]
+    kernels = [row for row in rows if row["what"] in ("terrain", *LABELLING.values())]
     progress.wrote(map_figures.save(map_figures.speed_figure(kernels), folder / "bench.png"))
 
 
@@ -121,8 +122,7 @@ def labelling_row(maps: int, setup: Setup, repeats: int) -> dict:
     """Measures labelling of this many maps at once, on compiled code."""
     heights = generate_terrain(*_mixture(0, maps), grid=setup.grid)
     heights = heights[0] if maps == 1 else heights
-    what = "labelling" if setup.contact.model == "nearest" else f"labelling, {setup.contact.model}"
-    return _timed(what, maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
+    return _timed(LABELLING[setup.contact.model], maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
 
 
 def reference_row(setup: Setup, on_progress: Callable[[int], object], repeats: int = 1) -> dict:

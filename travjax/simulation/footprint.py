@@ -127,11 +127,10 @@ def node_table(robot: Robot, actions: ActionSpace, grid: Grid) -> NodeTable:
     poses = _poses(actions, turn, first, np.arange(len(actions.radii)))
     return _table(
         poses,
+        _chassis_rows(poses.reshape(-1, 3), robot, grid, f"arc_lengths = {actions.arc_lengths}"),
         _wheel_nodes(actions, views, turn, first, robot, grid),
         _source(actions, views, turn, first),
         Layout(grid, views, poses.shape[1], len(actions.first_stations()), len(actions.radii)),
-        robot,
-        f"arc_lengths = {actions.arc_lengths}",
     )
 
 
@@ -141,15 +140,16 @@ def pose_table(poses: np.ndarray, robot: Robot, grid: Grid) -> NodeTable:
     Raises InputError when one of them leaves the map.
     """
     right, forward = np.array(robot.wheel_positions()).T
+    rows = _chassis_rows(poses.reshape(-1, 3), robot, grid, "poses")
     wheels = _nodes_under(poses, right, forward, grid, "poses")[..., None]
     layout = Layout(grid, (View(),), poses.shape[1], poses.shape[1], 0)
-    return _table(poses, wheels, np.arange(len(poses)), layout, robot, "poses")
+    return _table(poses, rows, wheels, np.arange(len(poses)), layout)
 
 
-def _table(poses: np.ndarray, wheels: np.ndarray, source: np.ndarray, layout: Layout, robot: Robot, what: str):
-    """Completes a NodeTable; what: the argument that errors name."""
+def _table(poses: np.ndarray, rows: tuple[np.ndarray, ...], wheels, source: np.ndarray, layout: Layout) -> NodeTable:
+    """Completes a NodeTable; rows: of `_chassis_rows`."""
     grid, flat = layout.grid, poses.reshape(-1, 3)
-    row, start, count = _chassis_rows(flat, robot, grid, what)
+    row, start, count = rows
     centre = np.floor(flat[:, 1::-1] / grid.spacing + grid.cells / 2 + 0.5).astype(np.int32)
     chassis = np.stack([row - centre[:, :1], start - centre[:, 1:], count], axis=1).astype(np.int16)
     by_arc = lambda array: np.ascontiguousarray(array).reshape(*poses.shape[:2], *array.shape[1:])
