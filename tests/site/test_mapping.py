@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from PIL import Image
 
 from tests.commandline import run_words
 from travjax.config import InputError
+from travjax.rasters.grid_maps import read_grid_map, write_grid_map
+from travjax.rasters.reading_options import DemOptions
 from travjax.simulation.events import Margins
 from travjax.simulation.robot import Robot
 from travjax.site import kernel, mapping
@@ -92,8 +95,6 @@ def test_bands_and_costs_are_those_of_the_specification():
 
 
 def test_a_further_event_has_a_band_behind_the_others():
-    from dataclasses import replace
-
     robot = replace(ROBOT, max_roll=0.2)
     assert band_names(robot) == (*band_names(ROBOT), "roll")
     slope = 0.5 * np.arange(40)[:, None] * 0.0625 + np.zeros((40, 40))
@@ -159,7 +160,7 @@ def test_everything_that_is_written_is_printed(mapped):
     out, text = mapped
     files = {path for path in out.rglob("*") if path.suffix in (".tif", ".png", ".yaml", ".txt")}
     assert {path for path in files if str(path) in text} == files - set(out.glob("nav2/*.png"))
-    assert "passable in" in text and "every direction" in text
+    assert "passable in" in text and "every known direction" in text
     for name in ("map.png", "why.png"):
         Image.open(out / name).verify()
 
@@ -173,7 +174,7 @@ def test_arrays_in_memory_are_the_same(mapped, site_file):
             np.testing.assert_array_equal(found.bands[name], file.read(band)[::-1])
     assert found.x[:2].tolist() == [EASTING, EASTING + 0.25] and found.y[0] == NORTHING and found.crs == "EPSG:32632"
     assert sum(found.shares().values()) == pytest.approx(1)
-    np.testing.assert_allclose(found.heights + site.height_offset, heights()[::4, ::4], atol=1e-3)
+    np.testing.assert_allclose(found.heights, heights()[::4, ::4], atol=1e-3)
 
 
 def test_xarray_gets_names_and_coordinates():
@@ -263,13 +264,71 @@ def test_coarse_cells_are_refused_unless_allowed_and_then_explained(tmp_path):
         (("--spacing", 0), "spacing = 0.0: must be"),
         (("--robot", "nobody"), "robot"),
         (("--scheduler", "nowhere"), "--scheduler nowhere: cannot be reached"),
-        (("--grid-map", "out.bag"), "--grid-map = 'out.bag': must be a name that ends in .mcap or .db3"),
+        (
+            ("--grid-map", "out.bag"),
+            "--grid-map = 'out.bag': must be a file in a folder that exists, its name ending in .mcap or .db3",
+        ),
     ],
 )
 def test_bad_options_are_one_line(site_file, tmp_path, more, message):
     code, _, err = run_words("map", site_file, "--out", tmp_path / "out", *more)
     assert code == 2 and message in err and err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_margin_just_above_its_limit_fails():
+    limits = np.array([0.095, 0.031, 0.224], np.float32)
+    robot = replace(ROBOT, max_step=0.095, ride_height=0.031, max_tilt=0.224)
+    for event in range(3):
+        fields = [np.zeros((1, 1, 1), np.float32) for _ in range(3)]
+        fields[event][...] = np.nextafter(limits[event], np.float32(1))
+        bands, costs = products(Margins(*fields, np.ones((1, 1, 1), bool)), robot)
+        assert costs[0, 0, 0] == 100 and bands[0, 0, 0] == 0 and bands[7, 0, 0] == 1 + event and bands[4 + event] > 1
+        fields[event][...] = limits[event]
+        bands, costs = products(Margins(*fields, np.ones((1, 1, 1), bool)), robot)
+        assert costs[0, 0, 0] == 99 and bands[0, 0, 0] == 1 and bands[7, 0, 0] == 0
+
+
+def test_the_site_itself_is_not_overwritten(site_file, tmp_path):
+    own = tmp_path / "map.tif"
+    own.write_bytes(site_file.read_bytes())
+    for more in ((), ("--method", "geometric")):
+        written = tmp_path / ("map.tif" if not more else "geometric.tif")
+        written.write_bytes(site_file.read_bytes())
+        code, _, err = run_words("map", written, "--headings", 1, "--out", tmp_path, *more)
+        assert code == 2 and f"--out = {str(tmp_path)!r}: must be a folder other than that of the site" in err
+        assert written.read_bytes() == site_file.read_bytes()
+
+
+@pytest.mark.parametrize(("shape", "cell"), [((2, 96), 0.0625), ((40, 40), 0.2)])
+def test_narrow_lattices_and_coarse_cells_are_mapped(tmp_path, shape, cell):
+    np.savez(tmp_path / "site.npz", heights=np.zeros(shape), cell_size=cell, origin=(2.0, 3.0))
+    code, _, err = run_words("map", tmp_path / "site.npz", "--headings", 1, "--allow-coarse", "--out", tmp_path / "out")
+    assert code == 0, err
+    _, said = decoded(tmp_path / "out/nav2/best.yaml")
+    stride = 0.25 if cell < 0.1 else 0.4
+    assert float(said["resolution"]) == stride and said["origin"] == f"[{2 - stride / 2!r}, {3 - stride / 2!r}, 0.0]"
+
+
+def test_a_recording_keeps_its_frame_and_its_heights(tmp_path):
+    pytest.importorskip("rosbags", reason="the extra ros is not installed")
+    ground = np.full((50, 60), 1834.25, np.float32)
+    write_grid_map(tmp_path / "in.mcap", {"z": ground}, 0.0625, (1.0, 2.0), "odom")
+    words = (
+        "map",
+        tmp_path / "in.mcap",
+        "--headings",
+        1,
+        "--out",
+        tmp_path / "out",
+        "--grid-map",
+        tmp_path / "out.mcap",
+    )
+    code, _, err = run_words(*words)
+    assert code == 0, err
+    raster = read_grid_map(tmp_path / "out.mcap", DemOptions(layer="elevation"))
+    assert raster.frame == "odom" and raster.origin == pytest.approx((1.0, 2.0))
+    assert raster.heights[0:2, 0:2].tolist() == [[1834.25, 1834.25]] * 2
 
 
 def test_several_maps_in_one_file_are_no_site(tmp_path):

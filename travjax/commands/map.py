@@ -3,6 +3,7 @@
 import argparse
 
 from travjax import options, progress
+from travjax.config import require
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 from travjax.signals import going_on
@@ -28,7 +29,12 @@ def add(commands: options.Commands) -> None:
         help="simulate passes, or compute the cost map of UNSTR-NAV, which has no headings, as a baseline (passes)",
     )
     parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
-    parser.add_argument("--stride", type=float, metavar="M", help="metres between places (0.25, or one coarse cell)")
+    parser.add_argument(
+        "--stride",
+        type=float,
+        metavar="M",
+        help="metres between places (0.25, or as many coarse cells as make up that)",
+    )
     parser.add_argument(
         "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
     )
@@ -49,8 +55,12 @@ def run(arguments: argparse.Namespace) -> None:
     from travjax.site.mapping import coarse_note, save_map, setup_of
 
     passes = arguments.robot, arguments.headings, arguments.stride
-    nodes = 0.0625 if arguments.spacing is None else arguments.spacing
-    setup_of(*passes, nodes, arguments.contact)  # refuses what is wrong before the site is read
+    if arguments.method == "geometric":
+        for name in ("grid_map", "scheduler"):
+            given = getattr(arguments, name)
+            require(given is None, f"--{name.replace('_', '-')}", str(given), "left out with --method geometric")
+    if arguments.spacing is not None or not arguments.allow_coarse:  # refuses what is wrong before the site is read
+        setup_of(*passes, 0.0625 if arguments.spacing is None else arguments.spacing, arguments.contact)
     site = SiteGround.open(
         arguments.site,
         arguments.spacing,

@@ -115,8 +115,9 @@ def _raster(message: Any, options: DemOptions) -> Raster:
     centre = info.pose.position
     origin = float(centre.x) - (cols - 1) / 2 * cell_size, float(centre.y) - (rows - 1) / 2 * cell_size
     scale = 1.0 if options.height_scale is None else options.height_scale
-    notes = (f"frame {message.header.frame_id!r}" if hasattr(message, "header") else f"frame {info.header.frame_id!r}",)
-    return Raster(InMetres(np.ascontiguousarray(heights), scale, nodata=options.nodata), cell_size, origin, None, notes)
+    frame = str((message if hasattr(message, "header") else info).header.frame_id)  # it lies in ROS 1 within info
+    values = InMetres(np.ascontiguousarray(heights), scale, nodata=options.nodata)
+    return Raster(values, cell_size, origin, None, (f"frame {frame!r}",), frame=frame)
 
 
 def _unrolled(layer: Any, outer: int, inner: int) -> np.ndarray:

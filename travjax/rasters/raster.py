@@ -50,6 +50,7 @@ class Raster:
     crs:           coordinate system as the file names it, or None
     notes:         lines about how the file was read that its user should know
     height_offset: metres above which the heights are counted already, where it is a window that was written so
+    frame:         name of the frame of a recording of ROS, else None
     """
 
     heights: HeightSource
@@ -58,6 +59,7 @@ class Raster:
     crs: str | None = None
     notes: tuple[str, ...] = ()
     height_offset: float | None = None
+    frame: str | None = None
 
 
 class InMetres:

@@ -52,8 +52,8 @@ def as_maps(heights: Any, grid: Grid) -> tuple[Float[Array, "n rows cols"], bool
     return jnp.asarray(maps, jnp.float32), heights.ndim == 2
 
 
-def as_site(heights: Any) -> Float[np.ndarray, "rows cols"]:
-    """Returns a checked float32 raster of any size, NaN where unknown, relative to its median height in whole metres.
+def as_site(heights: Any) -> tuple[Float[np.ndarray, "rows cols"], float]:
+    """Returns a checked float32 raster of any size, NaN where unknown, above its median in whole metres, and that.
 
     Raises InputError when heights are not numbers in two dimensions, and for impossible ones, as `as_maps` does.
     """
@@ -64,7 +64,7 @@ def as_site(heights: Any) -> Float[np.ndarray, "rows cols"]:
     require_close(array)
     known = array[np.isfinite(array)]
     level = np.round(np.median(known)) if known.size else 0.0
-    return (array - level).astype(np.float32)
+    return (array - level).astype(np.float32), float(level)
 
 
 @jax.jit

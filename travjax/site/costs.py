@@ -4,6 +4,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, UInt8
 
 from travjax.simulation.events import PAPER, Margins
@@ -11,6 +12,10 @@ from travjax.simulation.robot import Robot
 
 IMPASSABLE, UNKNOWN_COST = 100, 255
 """Costs of a pass that fails, and of one that is unknown; the others are 99 times the largest share of a limit."""
+
+
+OVER = float(np.nextafter(np.float32(1), np.float32(2)))
+"""The smallest share of a limit that exceeds it."""
 
 
 def band_names(robot: Robot) -> tuple[str, ...]:
@@ -28,17 +33,19 @@ def products(margins: Margins, robot: Robot) -> tuple[Float[Array, "b r c"], UIn
     Source: SPEC section 13.
     """
     known = margins.known
-    limits = zip(robot.event_names, robot.limits, strict=True)
-    shares = jnp.stack([margins[name] / jnp.float32(limit) for name, limit in limits])
-    largest = shares.max(axis=0)
-    percent = jnp.clip(jnp.floor(99 * largest), 0, 99)
-    cost = jnp.where(largest > 1, IMPASSABLE, percent)
+    # Without the barrier XLA multiplies by reciprocals, which are rounded.
+    limits = jax.lax.optimization_barrier(jnp.array(robot.limits, jnp.float32))[:, None, None, None]
+    of_events = jnp.moveaxis(margins.events(), -1, 0)
+    over = of_events > limits  # a quotient may be rounded to 1
+    shares, fails = jnp.where(over, jnp.maximum(of_events / limits, OVER), of_events / limits), over.any(axis=0)
+    percent = jnp.clip(jnp.floor(99 * shares.max(axis=0)), 0, 99)
+    cost = jnp.where(fails, IMPASSABLE, percent)
     count = known.sum(axis=0)
     somewhere = count > 0
     over_headings = jnp.where(known, shares, -jnp.inf).max(axis=1)
     worst_event = over_headings.argmax(axis=0)
     counts = [
-        (known & (largest <= 1)).sum(axis=0),
+        (known & ~fails).sum(axis=0),
         jnp.where(known, cost, jnp.inf).min(axis=0),
         jnp.where(known, cost, -jnp.inf).max(axis=0),
     ]

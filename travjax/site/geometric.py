@@ -16,15 +16,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from travjax import progress
-from travjax.config import require
 from travjax.evaluation.tables import rows_table
-from travjax.files import output_folder, save_text
+from travjax.files import held, output_folder, save_text
 from travjax.jax_flags import usual_flags
 from travjax.simulation.robot import Robot
-from travjax.site.costs import UNKNOWN_COST
+from travjax.site.costs import UNKNOWN_COST, band_names
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
 from travjax.site.ground import SiteGround
 from travjax.site.kernel import SiteSetup, by_place, lanes_of, tiles_of
+from travjax.site.mapping import require_not_written
 from travjax.site.nav2 import save_nav2
 from travjax.traversal.arcs import read
 
@@ -87,43 +87,49 @@ def _costs(ground: jax.Array, nodes: jax.Array, offsets: jax.Array, setup: SiteS
 def save_geometric(site: SiteGround, setup: SiteSetup, out: str | Path) -> Path:
     """Writes the geometric cost map of a site, geometric.tif and one for Nav2; returns the folder.
 
-    Beside a map of passes in the folder, it prints and writes how far the two agree.
+    Beside a map of passes of the same site, robot and places in the folder, it prints and writes how far they agree.
     Raises InputError when rasterio is missing, or when something cannot be read or written.
     """
     rasterio()
-    folder, lattice = output_folder(out), setup.lattice(site.shape)
-    bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
-    with progress.bar("mapping", len(tiles_of(lattice, setup)), "tile") as bar:
-        for tile in tiles_of(lattice, setup):
-            rows, cols = tile.within(lattice)
-            found = np.asarray(geometric_tile(site.part(*tile.ground(setup)), setup))
-            bands[:, rows, cols] = found[:, : rows.stop - rows.start, : cols.stop - cols.start]
-            bar.update()
-    bands, frame = bands[:, ::-1], Frame(site.origin, setup.stride, site.crs)
-    cost = bands[-1]
-    percent = np.where(np.isnan(cost), UNKNOWN_COST, np.floor(np.nan_to_num(cost) * (100 / FORBIDDEN))).astype(np.uint8)
-    written = [
-        save_geotiff(folder / "geometric.tif", bands, BANDS, frame, float("nan"), {"robot": setup.robot.name}),
-        *save_nav2(folder / "nav2", {"geometric": percent}, frame),
-    ]
-    if (folder / "map.tif").exists():
-        table = _comparison(folder / "map.tif", cost)
-        progress.say(f"The geometric map beside that of passes:\n{table}\n")
-        written.append(save_text(folder / "geometric.txt", table + "\n"))
+    require_not_written(site, [Path(out) / "geometric.tif"])
+    lattice = setup.lattice(site.shape)
+    with held(folder := output_folder(out)):
+        bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
+        with progress.bar("mapping", len(tiles_of(lattice, setup)), "tile") as bar:
+            for tile in tiles_of(lattice, setup):
+                rows, cols = tile.within(lattice)
+                found = np.asarray(geometric_tile(site.part(*tile.ground(setup)), setup))
+                bands[:, rows, cols] = found[:, : rows.stop - rows.start, : cols.stop - cols.start]
+                bar.update()
+        bands, frame = bands[:, ::-1], Frame(site.origin, setup.stride, site.crs)
+        cost = bands[-1]
+        percent = np.where(np.isnan(cost), UNKNOWN_COST, np.floor(np.nan_to_num(cost) * (100 / FORBIDDEN)))
+        table = _comparison(folder / "map.tif", cost, setup, site)
+        written = [
+            save_geotiff(folder / "geometric.tif", bands, BANDS, frame, float("nan"), {"robot": setup.robot.name}),
+            *save_nav2(folder / "nav2", {"geometric": percent.astype(np.uint8)}, frame),
+        ]
+        if table:
+            progress.say(f"The geometric map beside that of passes:\n{table}\n")
+            written.append(save_text(folder / "geometric.txt", table + "\n"))
     progress.wrote(*written)
     return folder
 
 
-def _comparison(path: Path, cost: np.ndarray) -> str:
+def _comparison(path: Path, cost: np.ndarray, setup: SiteSetup, site: SiteGround) -> str:
     """Returns a table of what the geometric map says of places that are passable in every direction, some and none.
 
-    Raises InputError when the map in the folder has other places.
+    It is empty unless a map of passes of the same site, robot and places lies in the folder.
     """
+    if not path.is_file():
+        return ""
     with rasterio().open(path) as file:
-        require(file.shape == cost.shape, f"{path}: size", file.shape, f"{cost.shape}, as that of the geometric map")
+        same = file.shape == cost.shape and file.descriptions[:2] == band_names(setup.robot)[:2]
+        if not same or (file.tags().get("robot"), file.tags().get("site_sha256")) != (setup.robot.name, site.sha256):
+            return ""
         passable, known = file.read([1, 2])
     both = (known > 0) & ~np.isnan(cost)
-    kinds = {"every direction": passable == known, "some directions": (passable > 0) & (passable < known)}
+    kinds = {"every known direction": passable == known, "some directions": (passable > 0) & (passable < known)}
     kinds["no direction"] = passable == 0
     rows = []
     for name, of_kind in kinds.items():

@@ -102,5 +102,7 @@ def _input_error(path: Path) -> Iterator[None]:
         yield
     except CRSError as error:
         raise InputError(f"{path}: crs: {error}") from None
+    except UnicodeEncodeError:
+        raise InputError(f"{path}: name: must be UTF-8, which GDAL wants; choose another") from None
     except RasterioError as error:
         raise InputError(f"{path}: cannot be written: {error}") from None

@@ -30,9 +30,10 @@ class Ground(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ArrayGround:
-    """A site in memory: heights [rows, cols], float32 metres, NaN where unknown."""
+    """A site in memory: heights [rows, cols], float32 metres above `height_offset`, NaN where unknown."""
 
     heights: Float[np.ndarray, "rows cols"]
+    height_offset: float = 0.0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -59,7 +60,8 @@ class SiteGround:
     crs:           coordinate system as the file names it, or None
     cell_size:     metres between values in the file
     height_offset: metres, subtracted from the file's heights
-    path, sha256:  the file and its checksum; reading: the options it was read with, for JSON
+    path, sha256:  the file and its checksum; reading: the options it was read with, and what was found, for JSON
+    frame:         of a recording of ROS, else None
     notes:         lines about how it was read
     """
 
@@ -71,6 +73,7 @@ class SiteGround:
     path: str
     sha256: str
     reading: Mapping[str, Any]
+    frame: str | None
     notes: tuple[str, ...]
     _surface: Surface = field(repr=False)
 
@@ -107,14 +110,15 @@ class SiteGround:
             surface = Surface(raster, nodes, above, fill_holes and raster.height_offset is None)
             checksum = sha256(path)
         return SiteGround(
-            spacing=nodes,
-            origin=raster.origin,
+            spacing=float(nodes),
+            origin=(float(raster.origin[0]), float(raster.origin[1])),
             crs=raster.crs,
-            cell_size=raster.cell_size,
-            height_offset=offset,
+            cell_size=float(raster.cell_size),
+            height_offset=float(offset),
             path=str(path),
             sha256=checksum,
-            reading=to_json(reading) | {"fill_holes": fill_holes},
+            reading=to_json(reading) | {"fill_holes": fill_holes, "found": [repr(one) for one in vars(found).values()]},
+            frame=raster.frame,
             notes=raster.notes,
             _surface=surface,
         )

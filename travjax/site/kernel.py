@@ -162,7 +162,7 @@ def simulate_site(
     chosen = chosen_robot(robot)
     passes = straight_passes(stride=stride) if primitives is None else tuple(primitives)
     setup = SiteSetup(chosen, passes, spacing, stride, interval, contact or chosen.contact or "tyre")
-    ground = ArrayGround(as_site(heights))
+    ground = ArrayGround(*as_site(heights))
     lattice = setup.lattice(ground.shape)
     found = [np.full((len(passes), *lattice), np.nan, np.float32) for _ in chosen.events]
     known = np.zeros((len(passes), *lattice), bool)

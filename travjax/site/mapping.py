@@ -1,6 +1,7 @@
 """Maps of whole sites: simulated tile by tile, and written for GIS and navigation (SPEC section 13)."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -10,10 +11,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from travjax import progress
-from travjax.config import require, require_length, to_json
+from travjax.config import one_line, require, require_length, require_number, to_json
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
-from travjax.files import atomic_write, held, output_folder, save_text
+from travjax.files import atomic_write, held, output_folder, resolved, save_text
 from travjax.memory import require_memory
 from travjax.rasters.grid_maps import rosbags, write_grid_map
 from travjax.simulation.heights import as_site
@@ -40,7 +41,7 @@ class SiteMap:
     bands:    by the names of costs.band_names, [rows, cols] float32 each: counts of headings, costs 0 to 100, margins
               as shares of their limits, and the number of the blocking event, 0 for none; NaN where unknown
     costs:    [headings, rows, cols] 0 to 100, 255 where unknown
-    heights:  [rows, cols] metres, of the ground at the places
+    heights:  [rows, cols] float64 metres, of the ground at the places, NaN unknown
     headings: radians, anticlockwise from +y; x, y: metres, of the columns and rows; crs: None for none
     """
 
@@ -75,10 +76,12 @@ def setup_of(
 ) -> SiteSetup:
     """Returns the setup of a map: a straight pass in each heading.
 
-    stride: metres between places; 0.25 m or one node unless given; contact: "tyre" unless given here or by the robot
+    stride:  metres between places; 0.25 m unless given, or as many nodes as make that up
+    contact: "tyre" unless given here or by the robot
     Raises InputError that names argument, value and what is allowed.
     """
-    chosen, places = chosen_robot(robot), max(0.25, spacing) if stride is None else stride
+    require_number("spacing", spacing, 0, 1000, "metres, above 0 and at most 1000")
+    chosen, places = chosen_robot(robot), math.ceil(0.25 / spacing - 1e-6) * spacing if stride is None else stride
     require_length("stride", places, 0.001, 1000)
     model = contact or chosen.contact or "tyre"
     return SiteSetup(chosen, straight_passes(headings, places), spacing, places, contact=model)
@@ -106,17 +109,18 @@ def map_site(
     if isinstance(site, str | Path):
         ground = SiteGround.open(site, spacing)
     else:
-        ground = site if isinstance(site, SiteGround) else ArrayGround(as_site(site))
+        ground = site if isinstance(site, SiteGround) else ArrayGround(*as_site(site))
     nodes = ground.spacing if isinstance(ground, SiteGround) else 0.0625 if spacing is None else spacing
     setup = setup_of(robot, headings, stride, nodes, contact)
     names, lattice = band_names(setup.robot), setup.lattice(ground.shape)
     bands = np.full((len(names), *lattice), np.nan, np.float32)
     costs = np.full((headings, *lattice), UNKNOWN_COST, np.uint8)
-    heights = np.full(lattice, np.nan, np.float32)
+    heights = np.full(lattice, np.nan)
     with executor() as pool:
         for _, part in parts_of(ground, setup, pool):
             place = ..., *part.tile.within(lattice)
-            bands[place], costs[place], heights[place] = part.bands, part.costs, part.heights
+            bands[place], costs[place] = part.bands, part.costs
+            heights[place] = part.heights.astype(float) + ground.height_offset
     origin = ground.origin if isinstance(ground, SiteGround) else (0.0, 0.0)
     x, y = (start + setup.stride * np.arange(count) for start, count in zip(origin, lattice[::-1], strict=True))
     angles = 2 * np.pi * np.arange(headings) / headings
@@ -141,7 +145,9 @@ def save_map(
     rasterio()
     if grid_map is not None:
         rosbags()
-        require(grid_map.suffix in (".mcap", ".db3"), "--grid-map", str(grid_map), "a name that ends in .mcap or .db3")
+        fits = grid_map.suffix in (".mcap", ".db3") and grid_map.parent.is_dir() and not grid_map.is_dir()
+        require(fits, "--grid-map", str(grid_map), "a file in a folder that exists, its name ending in .mcap or .db3")
+    require_not_written(site, [Path(out) / "map.tif", Path(out) / "headings.tif", *([grid_map] if grid_map else [])])
     with executor(scheduler) as pool, held(folder := output_folder(out)):
         store = _simulated(site, setup, folder, pool)
         written = _written(store, site, setup, folder)
@@ -152,10 +158,23 @@ def save_map(
     return folder
 
 
+def require_not_written(site: SiteGround, files: Iterable[Path]) -> None:
+    """Raises InputError where one of the files to be written is the site's own."""
+    for file in files:
+        other = resolved(file) != resolved(Path(site.path))
+        require(other, "--out", str(file.parent), f"a folder other than that of the site, {site.path}")
+
+
 def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Executor, int]) -> Store:
     lattice, names = setup.lattice(site.shape), band_names(setup.robot)
     tiles = tiles_of(lattice, setup)
-    settings = {"site": site.sha256, "reading": site.reading, "setup": to_json(setup), "travjax": version("travjax")}
+    settings = {
+        "site": site.sha256,
+        "reading": site.reading,
+        "setup": to_json(setup),
+        "tiles": [len(tiles), tiles[0].edge],
+    }
+    settings["travjax"] = version("travjax")
     store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
     with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:
         for number, part in parts_of(site, setup, pool, set(np.flatnonzero(store.done).tolist())):
@@ -171,14 +190,17 @@ def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> 
     tags = {
         "robot": setup.robot.name,
         "contact": setup.contact,
-        "site": Path(site.path).name,
+        "site": one_line(Path(site.path).name),
+        "travjax": version("travjax"),
+        "spacing": setup.spacing,
         "site_sha256": site.sha256,
         "blocking_event": events,
     }
     bands = dict(zip(names, store.bands, strict=True))
     shares = _shares(bands["passable_headings"], bands["known_headings"])
     table = rows_table([{"passable in": name, "share of places": f"{share:.1%}"} for name, share in shares.items()])
-    heading = f"{setup.robot.name}, {setup.contact}, {len(degrees)} headings, {setup.stride:g} m apart"
+    count = f"{len(degrees)} headings" if len(degrees) > 1 else "1 heading"
+    heading = f"{setup.robot.name}, {setup.contact}, {count}, places {setup.stride:g} m apart"
     progress.say(f"{heading}\n{table}\n")
     what = heading, Path(site.path).name
     layers = [f"heading {angle:g} deg" for angle in degrees]
@@ -196,9 +218,10 @@ def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> 
 
 def _save_grid_map(path: Path, store: Store, site: SiteGround, setup: SiteSetup) -> Path:
     require_memory(4 * store.bands.nbytes, f"{path}: {store.bands.nbytes} bytes of layers", "; leave --grid-map out")
-    layers = dict(zip(band_names(setup.robot), store.bands[:, ::-1], strict=True)) | {"elevation": store.heights[::-1]}
+    layers = dict(zip(band_names(setup.robot), store.bands[:, ::-1], strict=True))
+    layers["elevation"] = store.heights[::-1] + np.float32(site.height_offset)
     with atomic_write(path) as temporary:
-        write_grid_map(temporary, layers, setup.stride, site.origin)
+        write_grid_map(temporary, layers, setup.stride, site.origin, site.frame or "map")
     return path
 
 
@@ -208,7 +231,7 @@ def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
         ways, seen = passable[top : top + 512], known[top : top + 512]
         every, some, unknown = (ways == seen) & (seen > 0), (ways > 0) & (ways < seen), seen == 0
         counts += [every.sum(), some.sum(), (ways == 0).sum(), unknown.sum()]
-    names = ("every direction", "some directions", "no direction", "unknown")
+    names = ("every known direction", "some directions", "no direction", "unknown")
     return dict(zip(names, (counts / known.size).tolist(), strict=True))
 
 

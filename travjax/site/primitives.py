@@ -53,7 +53,7 @@ class Primitive:
 def straight_passes(headings: int = 16, stride: float = 0.25) -> tuple[Primitive, ...]:
     """Returns the straight drive through a place in each of the headings, half a stride before and behind it.
 
-    Together those of neighbouring places cover every straight drive. Source: SPEC section 13.
+    Together those of neighbouring places cover straight drives along rows and columns. Source: SPEC section 13.
     Raises InputError unless there are 1 to 360 headings.
     """
     whole = isinstance(headings, Integral) and not isinstance(headings, bool)

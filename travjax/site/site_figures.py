@@ -79,7 +79,9 @@ def _draw(ax, heights: np.ndarray, kind: np.ndarray, colours: Sequence[str], fra
     shown = np.asarray(heights[::every, ::every], float)
     level = np.nanmean(shown) if np.isfinite(shown).any() else 0.0
     cell = frame.cell_size * every
-    shade = LightSource(315, 45).hillshade(np.nan_to_num(shown, nan=level), dx=cell, dy=cell)
+    shade = np.ones_like(shown)
+    if min(shown.shape) > 1:
+        shade = LightSource(315, 45).hillshade(np.nan_to_num(shown, nan=level), dx=cell, dy=cell)
     ax.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1)
     kinds: Any = dict(cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5, interpolation="nearest")
     ax.imshow(kind, extent=extent, alpha=0.62, **kinds)
@@ -92,7 +94,8 @@ def _draw(ax, heights: np.ndarray, kind: np.ndarray, colours: Sequence[str], fra
 def _scale_bar(ax, extent: tuple[float, float, float, float]) -> None:
     west, east, south, north = extent
     wide = east - west
-    length = max(size for size in (k * 10.0**power for power in range(-2, 6) for k in (1, 2, 5)) if size <= wide / 4)
+    sizes = (k * 10.0**power for power in range(-2, 6) for k in (1, 2, 5))
+    length = max((size for size in sizes if size <= wide / 4), default=wide / 4)
     left, low = west + 0.04 * wide, south + 0.05 * (north - south)
     ax.plot([left, left + length], [low, low], color="white", linewidth=5, solid_capstyle="butt")
     ax.plot([left, left + length], [low, low], color="black", linewidth=2.5, solid_capstyle="butt")

@@ -5,6 +5,7 @@ that are missing.
 """
 
 import json
+import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from travjax.config import InputError
+from travjax.config import InputError, require
 from travjax.files import save_text
 from travjax.site.costs import UNKNOWN_COST
 from travjax.site.tiling import Part
@@ -43,10 +44,11 @@ class Store:
         Raises InputError when they cannot be written.
         """
         folder, text = out / FOLDER, json.dumps(settings, sort_keys=True)
+        require(not folder.is_file(), "--out", str(out), f"a folder without a file called {FOLDER}")
         kept = folder / "settings.json"
         if not (kept.is_file() and kept.read_text(encoding="utf-8") == text):
             shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
+            folder.mkdir(exist_ok=True)
         arrays = {
             "bands": ((bands, *lattice), np.float32, np.nan),
             "costs": ((headings, *lattice), np.uint8, UNKNOWN_COST),
@@ -56,6 +58,7 @@ class Store:
         try:
             mapped = [_mapped(folder / f"{name}.npy", *array) for name, array in arrays.items()]
         except OSError as error:
+            shutil.rmtree(folder, ignore_errors=True)
             raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from None
         save_text(kept, text)
         return Store(folder, *mapped)
@@ -77,4 +80,8 @@ class Store:
 def _mapped(path: Path, shape: tuple[int, ...], dtype, unknown) -> np.ndarray:
     if path.is_file():
         return np.lib.format.open_memmap(path, mode="r+")
-    return np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+    array = np.lib.format.open_memmap(path, mode="w+", dtype=dtype, shape=shape)
+    with path.open("r+b") as file:
+        os.posix_fallocate(file.fileno(), 0, path.stat().st_size)  # a full disk would end the process without a word
+    array[...] = unknown
+    return array
