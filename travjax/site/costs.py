@@ -18,6 +18,15 @@ OVER = float(np.nextafter(np.float32(1), np.float32(2)))
 """The smallest share of a limit that exceeds it."""
 
 
+KINDS = ("every known direction", "some directions", "no direction", "unknown")
+"""How a place can be passable, by the number of `kinds_of`."""
+
+
+def kinds_of(passable: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Returns the number in KINDS of places, from the bands passable_headings and known_headings."""
+    return np.select([~(known > 0), passable == 0, passable < known], [3, 2, 1], 0)
+
+
 def band_names(robot: Robot) -> tuple[str, ...]:
     """Returns the names of the bands in order: counts, costs, the paper's events, what blocks, further events."""
     paper = robot.event_names[: len(PAPER)]

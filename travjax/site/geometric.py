@@ -20,7 +20,7 @@ from travjax.evaluation.tables import rows_table
 from travjax.files import held, output_folder, save_text
 from travjax.jax_flags import usual_flags
 from travjax.simulation.robot import Robot
-from travjax.site.costs import UNKNOWN_COST, band_names
+from travjax.site.costs import KINDS, UNKNOWN_COST, band_names, kinds_of
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
 from travjax.site.ground import SiteGround
 from travjax.site.kernel import SiteSetup, by_place, lanes_of, tiles_of
@@ -93,13 +93,13 @@ def save_geometric(site: SiteGround, setup: SiteSetup, out: str | Path) -> Path:
     rasterio()
     require_not_written(site, [Path(out) / "geometric.tif"])
     lattice = setup.lattice(site.shape)
+    tiles = tiles_of(lattice, setup)
     with held(folder := output_folder(out)):
         bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
-        with progress.bar("mapping", len(tiles_of(lattice, setup)), "tile") as bar:
-            for tile in tiles_of(lattice, setup):
-                rows, cols = tile.within(lattice)
-                found = np.asarray(geometric_tile(site.part(*tile.ground(setup)), setup))
-                bands[:, rows, cols] = found[:, : rows.stop - rows.start, : cols.stop - cols.start]
+        with progress.bar("mapping", len(tiles), "tile") as bar:
+            for tile in tiles:
+                found = geometric_tile(site.part(*tile.ground(setup)), setup)
+                bands[(..., *tile.within(lattice))] = tile.cropped(found, lattice)
                 bar.update()
         bands, frame = bands[:, ::-1], Frame(site.origin, setup.stride, site.crs)
         cost = bands[-1]
@@ -128,12 +128,9 @@ def _comparison(path: Path, cost: np.ndarray, setup: SiteSetup, site: SiteGround
         if not same or (file.tags().get("robot"), file.tags().get("site_sha256")) != (setup.robot.name, site.sha256):
             return ""
         passable, known = file.read([1, 2])
-    both = (known > 0) & ~np.isnan(cost)
-    kinds = {"every known direction": passable == known, "some directions": (passable > 0) & (passable < known)}
-    kinds["no direction"] = passable == 0
-    rows = []
-    for name, of_kind in kinds.items():
-        here = both & of_kind
+    kinds, rows = kinds_of(passable, known), []
+    for kind, name in enumerate(KINDS[:3]):
+        here = (kinds == kind) & ~np.isnan(cost)
         forbidden = f"{np.mean(cost[here] == FORBIDDEN):.1%}" if here.any() else "-"
         rows.append({"passable in": name, "places": int(here.sum()), "forbidden by the geometric map": forbidden})
     return rows_table(rows)

@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -79,13 +79,13 @@ class SiteSetup:
         """Nodes between neighbouring places."""
         return round(self.stride / self.spacing)
 
-    @property
+    @cached_property
     def grid(self) -> Grid:
         """A grid around a place that holds all poses."""
         half = math.ceil(self._reach / self.spacing) + 2
         return Grid(2 * half * self.spacing, self.spacing)
 
-    @property
+    @cached_property
     def _reach(self) -> float:
         """Metres from a place to the farthest point of the robot."""
         robot, poses = self.robot, all_poses(self.primitives, self.interval)
@@ -95,7 +95,7 @@ class SiteSetup:
         )
         return float(np.hypot(poses[..., 0], poses[..., 1]).max()) + outline / 2
 
-    @property
+    @cached_property
     def halo(self) -> int:
         """Places around a tile whose ground its margins depend on."""
         steps = reach_of_steps(self.robot.wheel_diameter / 2, self.spacing) if self.contact == "tyre" else 0
@@ -121,6 +121,11 @@ class Tile:
             slice(self.row, min(self.row + self.edge, lattice[0])),
             slice(self.col, min(self.col + self.edge, lattice[1])),
         )
+
+    def cropped(self, values, lattice: tuple[int, int]):
+        """Returns those of its values [..., edge, edge] whose places are on a lattice of so many rows and columns."""
+        rows, cols = self.within(lattice)
+        return values[..., : rows.stop - rows.start, : cols.stop - cols.start]
 
     def ground(self, setup: SiteSetup) -> tuple[slice, slice]:
         """Returns the rows and columns of nodes that its margins depend on, which may lie beyond the raster."""
@@ -161,7 +166,7 @@ def simulate_site(
     """
     chosen = chosen_robot(robot)
     passes = straight_passes(stride=stride) if primitives is None else tuple(primitives)
-    setup = SiteSetup(chosen, passes, spacing, stride, interval, contact or chosen.contact or "tyre")
+    setup = SiteSetup(chosen, passes, spacing, stride, interval, contact_of(chosen, contact))
     ground = ArrayGround(*as_site(heights))
     lattice = setup.lattice(ground.shape)
     found = [np.full((len(passes), *lattice), np.nan, np.float32) for _ in chosen.events]
@@ -170,13 +175,17 @@ def simulate_site(
     with ThreadPoolExecutor(workers()) as pool:
         simulated = pool.map(lambda tile: tile_margins(ground.part(*tile.ground(setup)), setup), tiles)
         for tile, margins in zip(tiles, simulated, strict=True):
-            rows, cols = tile.within(lattice)
-            own = slice(None), slice(rows.stop - rows.start), slice(cols.stop - cols.start)
+            place = ..., *tile.within(lattice)
             for field, name in zip(found, chosen.event_names, strict=True):
-                field[:, rows, cols] = margins[name][own]
-            known[:, rows, cols] = margins.known[own]
+                field[place] = tile.cropped(margins[name], lattice)
+            known[place] = tile.cropped(margins.known, lattice)
     step, obstacle, tilt, *optional = found
     return Margins(step, obstacle, tilt, known, tuple(optional), chosen.event_names)  # type: ignore[arg-type]
+
+
+def contact_of(robot: Robot, contact: str | None) -> str:
+    """Returns the contact model of a site: the given one, else that of the robot's file, else `tyre`."""
+    return contact or robot.contact or "tyre"
 
 
 def workers() -> int:

@@ -17,21 +17,19 @@ from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, held, output_folder, resolved, save_text
 from travjax.memory import require_memory
 from travjax.rasters.grid_maps import rosbags, write_grid_map
+from travjax.rasters.raster import COARSEST
 from travjax.simulation.heights import as_site
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.site import site_figures
-from travjax.site.costs import UNKNOWN_COST, band_names
+from travjax.site.costs import KINDS, UNKNOWN_COST, band_names, kinds_of
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
 from travjax.site.ground import ArrayGround, SiteGround
-from travjax.site.kernel import SiteSetup, tiles_of
+from travjax.site.kernel import SiteSetup, contact_of, tiles_of
 from travjax.site.nav2 import over_headings, save_nav2
 from travjax.site.primitives import straight_passes
 from travjax.site.store import Store
 from travjax.site.tiling import executor, parts_of
-
-COARSE = 0.125
-"""Metres: with larger cells a line says what the events still mean."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +81,7 @@ def setup_of(
     require_number("spacing", spacing, 0, 1000, "metres, above 0 and at most 1000")
     chosen, places = chosen_robot(robot), math.ceil(0.25 / spacing - 1e-6) * spacing if stride is None else stride
     require_length("stride", places, 0.001, 1000)
-    model = contact or chosen.contact or "tyre"
-    return SiteSetup(chosen, straight_passes(headings, places), spacing, places, contact=model)
+    return SiteSetup(chosen, straight_passes(headings, places), spacing, places, contact=contact_of(chosen, contact))
 
 
 def map_site(
@@ -173,8 +170,8 @@ def _simulated(site: SiteGround, setup: SiteSetup, folder: Path, pool: tuple[Exe
         "reading": site.reading,
         "setup": to_json(setup),
         "tiles": [len(tiles), tiles[0].edge],
+        "travjax": version("travjax"),
     }
-    settings["travjax"] = version("travjax")
     store = Store.open(folder, settings, len(names), len(setup.primitives), lattice, len(tiles))
     with progress.bar("mapping", len(tiles), "tile", initial=int(store.done.sum())) as bar:
         for number, part in parts_of(site, setup, pool, set(np.flatnonzero(store.done).tolist())):
@@ -226,18 +223,16 @@ def _save_grid_map(path: Path, store: Store, site: SiteGround, setup: SiteSetup)
 
 
 def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
-    counts = np.zeros(4)
+    counts = np.zeros(len(KINDS))
     for top in range(0, len(known), 512):
-        ways, seen = passable[top : top + 512], known[top : top + 512]
-        every, some, unknown = (ways == seen) & (seen > 0), (ways > 0) & (ways < seen), seen == 0
-        counts += [every.sum(), some.sum(), (ways == 0).sum(), unknown.sum()]
-    names = ("every known direction", "some directions", "no direction", "unknown")
-    return dict(zip(names, (counts / known.size).tolist(), strict=True))
+        kinds = kinds_of(passable[top : top + 512], known[top : top + 512])
+        counts += np.bincount(kinds.ravel(), minlength=len(KINDS))
+    return dict(zip(KINDS, (counts / known.size).tolist(), strict=True))
 
 
 def coarse_note(site: SiteGround, robot: Robot) -> str | None:
     """Returns a line about what the events mean on a site whose cells are coarse; None where they are not."""
-    if site.cell_size <= COARSE:
+    if site.cell_size <= COARSEST:
         return None
     return (
         f"cells of {site.cell_size:g} m: tilt is that of ground averaged over {site.cell_size:g} m (wheelbase "

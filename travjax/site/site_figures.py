@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from travjax.evaluation.map_figures import DOUBTFUL, FAILED, SAFE, UNKNOWN_COLOUR
-from travjax.site.costs import IMPASSABLE, UNKNOWN_COST
+from travjax.site.costs import IMPASSABLE, KINDS, UNKNOWN_COST, kinds_of
 from travjax.site.geotiff import Frame
 
 MOST = 1200
@@ -28,11 +28,10 @@ def passable_figure(
     """
     every = _every(heights.shape)
     ways, known = (np.asarray(bands[f"{name}_headings"][::every, ::every]) for name in ("passable", "known"))
-    kind = np.select([~(known > 0), ways == 0, ways < known], [3, 2, 1], 0)
+    colours = SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR
     figure, ax, side = _frame_of(heights, frame, what)
-    _draw(ax, heights, kind, (SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR), frame, every)
-    names = ("every known direction", "some directions", "no direction", "unknown")
-    _legend(side, dict(zip(names, (SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR), strict=True)), "passable in")
+    _draw(ax, heights, kinds_of(ways, known), colours, frame, every)
+    _legend(side, dict(zip(KINDS, colours, strict=True)), "passable in")
     place = _telling_place(bands, every)
     if place is not None:
         x = frame.origin[0] + place[1] * frame.cell_size

@@ -65,12 +65,10 @@ def executor(scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
 
     with ExitStack() as stack:
         try:
-            cluster = (
-                stack.enter_context(LocalCluster(threads_per_worker=1, dashboard_address=None))
-                if (scheduler == LOCAL)
-                else scheduler
-            )
-            client = stack.enter_context(Client(cluster, timeout=CONNECT))
+            where = scheduler
+            if scheduler == LOCAL:
+                where = stack.enter_context(LocalCluster(threads_per_worker=1, dashboard_address=None))
+            client = stack.enter_context(Client(where, timeout=CONNECT))
         except (OSError, ValueError, TimeoutError) as error:
             raise InputError(f"--scheduler {scheduler}: cannot be reached: {str(error)[:160]}") from None
         threads = sum(client.nthreads().values())
@@ -95,8 +93,7 @@ def parts_of(
 
 @usual_flags()
 def _part(ground: np.ndarray, tile: Tile, setup: SiteSetup, lattice: tuple[int, int]) -> Part:
-    rows, cols = (part.stop - part.start for part in tile.within(lattice))
     bands, costs = jax.device_get(products(tile_margins(ground, setup), setup.robot))
     first = setup.halo * setup.step
     heights = ground[first :: setup.step, first :: setup.step]
-    return Part(tile, bands[:, :rows, :cols], costs[:, :rows, :cols], heights[:rows, :cols])
+    return Part(tile, *(tile.cropped(values, lattice) for values in (bands, costs, heights)))
