@@ -9,6 +9,7 @@ well, and a line says so.
 
 import dataclasses
 import difflib
+import importlib.util
 import json
 import math
 import os
@@ -127,6 +128,12 @@ def load_table(path: str | Path, name: str, kind: type[Config]) -> Config | None
         return _inner(name, table[name], kind, f"[{name}]", f"[{name}]", {})  # type: ignore[return-value]
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+
+
+def require_installed(module: str, name: str, extra: str) -> None:
+    """Raises InputError that says how to install a library that is missing; extra: that of travjax which brings it."""
+    if importlib.util.find_spec(module) is None:
+        raise InputError(f'{name}: not installed; needed: pip install "travjax[{extra}]"')
 
 
 def say_renamed(where: object, older: Mapping[str, str]) -> None:

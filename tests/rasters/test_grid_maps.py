@@ -1,5 +1,6 @@
 """GridMap in recordings of ROS 1 and ROS 2: orientation, circular buffers, and what has to be chosen."""
 
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,7 +164,7 @@ def test_other_recordings_and_damaged_ones_are_one_line(tmp_path):
 
 def test_a_missing_library_is_named(monkeypatch, tmp_path):
     path = recorded(tmp_path / "map.mcap", [{"elevation": heights()}])
-    monkeypatch.setattr(grid_maps.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r'rosbags: not installed; needed: pip install "travjax\[ros\]"'):
         read(path)
 

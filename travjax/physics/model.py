@@ -5,7 +5,6 @@ hardly turns. The body is made of boxes, the chassis and what the overall outlin
 the robot's file says. Robot and map share the frames of SPEC section 1: x right, y forward.
 """
 
-import importlib.util
 from dataclasses import dataclass
 from itertools import pairwise, product
 from types import ModuleType
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax.config import InputError
+from travjax.config import require_installed
 from travjax.physics.config import PhysicsConfig
 from travjax.simulation.robot import Robot
 
@@ -35,8 +34,7 @@ BODY_HEIGHT = 0.2
 
 def mujoco() -> ModuleType:
     """Returns the module mujoco; raises InputError that says how to install it where it is missing."""
-    if importlib.util.find_spec("mujoco") is None:
-        raise InputError('MuJoCo: not installed; needed: pip install "travjax[physics]"')
+    require_installed("mujoco", "MuJoCo", "physics")
     import mujoco
 
     return mujoco

@@ -4,7 +4,6 @@ Rows of a GridMap run along -x and its columns along -y, from the corner with th
 circular buffers. Here, row 0 is the southernmost and column 0 the westernmost.
 """
 
-import importlib.util
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax.config import InputError, require
+from travjax.config import InputError, require, require_installed
 from travjax.rasters.raster import InMetres, Raster, agreed_cell_size
 from travjax.rasters.reading_options import DemOptions
 
@@ -42,8 +41,7 @@ TURNED = 1e-3
 
 def rosbags() -> ModuleType:
     """Returns the package rosbags; raises InputError that says how to install it where it is missing."""
-    if importlib.util.find_spec("rosbags") is None:
-        raise InputError('rosbags: not installed; needed: pip install "travjax[ros]"')
+    require_installed("rosbags", "rosbags", "ros")
     import rosbags.highlevel
     import rosbags.rosbag2
     import rosbags.typesys

@@ -1,6 +1,5 @@
 """Arrays of a site as cloud-optimised GeoTIFF, with a description of each band (SPEC section 13)."""
 
-import importlib.util
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from travjax.config import InputError
+from travjax.config import InputError, require_installed
 from travjax.files import atomic_write
 
 STRIP = 512
@@ -35,8 +34,7 @@ class Frame:
 
 def rasterio() -> ModuleType:
     """Returns the module rasterio; raises InputError that says how to install it where it is missing."""
-    if importlib.util.find_spec("rasterio") is None:
-        raise InputError('rasterio: not installed; needed: pip install "travjax[geo]"')
+    require_installed("rasterio", "rasterio", "geo")
     import rasterio
     import rasterio.shutil
 

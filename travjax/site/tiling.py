@@ -4,7 +4,6 @@ One thread reads and takes the results. Meanwhile as many tiles as there are cor
 process, or as many as there are threads in a cluster by the workers of Dask.
 """
 
-import importlib.util
 from collections import deque
 from collections.abc import Collection, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -15,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from travjax.config import InputError
+from travjax.config import InputError, require_installed
 from travjax.jax_flags import usual_flags
 from travjax.site.costs import products
 from travjax.site.ground import Ground
@@ -59,8 +58,7 @@ def executor(scheduler: str | None = None) -> Iterator[tuple[Executor, int]]:
             finally:
                 pool.shutdown(cancel_futures=True)
         return
-    if importlib.util.find_spec("distributed") is None:
-        raise InputError('Dask: not installed; needed: pip install "travjax[dask]"')
+    require_installed("distributed", "Dask", "dask")
     from distributed import Client, LocalCluster
 
     with ExitStack() as stack:
