@@ -4,6 +4,9 @@ from .config import InputError
 from .data.dataset import load_dataset
 from .data.dem import load_dem
 from .models.input_images import render_inputs
+from .planning.motions import Motions
+from .planning.no_path import NoPathError
+from .planning.planner import Plan, Planner, plan
 from .runs.predictor import Predictor, predict
 from .runs.run import load_estimator
 from .simulation.actions import ActionSpace
@@ -29,6 +32,10 @@ __all__ = [
     "Grid",
     "InputError",
     "Margins",
+    "Motions",
+    "NoPathError",
+    "Plan",
+    "Planner",
     "Predictor",
     "Primitive",
     "Robot",
@@ -47,6 +54,7 @@ __all__ = [
     "load_dem",
     "load_estimator",
     "map_site",
+    "plan",
     "predict",
     "render_inputs",
     "run_from_preset",

@@ -15,6 +15,7 @@ from travjax.rasters.raster import require_fine, require_known, survey
 from travjax.rasters.reading_options import DemOptions
 from travjax.rasters.surface import Surface
 from travjax.simulation.grid import Grid
+from travjax.simulation.heights import as_site
 
 
 class Ground(Protocol):
@@ -30,10 +31,16 @@ class Ground(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ArrayGround:
-    """A site in memory: heights [rows, cols], float32 metres above `height_offset`, NaN where unknown."""
+    """A site in memory: heights [rows, cols], float32 metres above `height_offset`, NaN where unknown.
+
+    spacing, origin, crs: as of SiteGround
+    """
 
     heights: Float[np.ndarray, "rows cols"]
     height_offset: float = 0.0
+    spacing: float = 0.0625
+    origin: tuple[float, float] = (0.0, 0.0)
+    crs: str | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -132,3 +139,19 @@ class SiteGround:
         """Returns some rows and columns; NaN off the site. Raises InputError when the file cannot be read."""
         with naming_file(Path(self.path)):
             return self._surface.nodes(rows, cols)
+
+
+Site = ArrayGround | SiteGround
+"""The ground of a site with what is known of it."""
+
+
+def open_site(site: str | Path | Site | Float[np.ndarray, "rows cols"], spacing: float | None = None) -> Site:
+    """Returns the ground of a site: of a file as `SiteGround.open` does, or of heights [rows, cols] in metres.
+
+    spacing: metres between nodes; 0.0625 unless given
+    """
+    if isinstance(site, str | Path):
+        return SiteGround.open(site, spacing)
+    if isinstance(site, ArrayGround | SiteGround):
+        return site
+    return ArrayGround(*as_site(site), 0.0625 if spacing is None else spacing)

@@ -28,8 +28,9 @@ from travjax.simulation.heights import as_site
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.simulation.tyre_tables import tyre_table
+from travjax.site import ground as grounds
 from travjax.site.ground import ArrayGround
-from travjax.site.primitives import Primitive, all_poses, straight_passes
+from travjax.site.primitives import PointTurn, Primitive, all_poses, straight_passes
 from travjax.traversal.arcs import UNKNOWN_HEIGHT, Shifted, arc_maxima, margins_from
 from travjax.traversal.nearest import NearestChunks, nearest_chunks, poses_on_nodes
 from travjax.traversal.steps import reach_of_steps
@@ -56,7 +57,7 @@ class SiteSetup:
     """
 
     robot: Robot
-    primitives: tuple[Primitive, ...]
+    primitives: tuple[Primitive | PointTurn, ...]
     spacing: float = 0.0625
     stride: float = 0.25
     interval: float = 0.06
@@ -73,6 +74,11 @@ class SiteSetup:
         finest = self._reach / (WIDEST // 2 - 2)
         allowed = f"at least {finest:.2g} m, at which {self.robot.name} with its passes spans {WIDEST} nodes"
         require(self.spacing >= finest, "spacing", self.spacing, allowed)
+
+    @staticmethod
+    def usual_stride(spacing: float) -> float:
+        """Returns the metres between places unless something else is wanted: 0.25, or as many nodes as make that up."""
+        return math.ceil(0.25 / spacing - 1e-6) * spacing
 
     @property
     def step(self) -> int:
@@ -167,20 +173,25 @@ def simulate_site(
     chosen = chosen_robot(robot)
     passes = straight_passes(stride=stride) if primitives is None else tuple(primitives)
     setup = SiteSetup(chosen, passes, spacing, stride, interval, contact_of(chosen, contact))
-    ground = ArrayGround(*as_site(heights))
-    lattice = setup.lattice(ground.shape)
-    found = [np.full((len(passes), *lattice), np.nan, np.float32) for _ in chosen.events]
-    known = np.zeros((len(passes), *lattice), bool)
+    return site_margins(ArrayGround(*as_site(heights)), setup)
+
+
+@usual_flags()
+def site_margins(ground: grounds.Ground, setup: SiteSetup) -> Margins:
+    """Simulates all primitives from every place of a site; returns NumPy arrays [primitives, rows, cols] of places."""
+    lattice, events = setup.lattice(ground.shape), setup.robot.events
+    found = [np.full((len(setup.primitives), *lattice), np.nan, np.float32) for _ in events]
+    known = np.zeros((len(setup.primitives), *lattice), bool)
     tiles = tiles_of(lattice, setup)
     with ThreadPoolExecutor(workers()) as pool:
         simulated = pool.map(lambda tile: tile_margins(ground.part(*tile.ground(setup)), setup), tiles)
         for tile, margins in zip(tiles, simulated, strict=True):
             place = ..., *tile.within(lattice)
-            for field, name in zip(found, chosen.event_names, strict=True):
-                field[place] = tile.cropped(margins[name], lattice)
+            for field, event in zip(found, events, strict=True):
+                field[place] = tile.cropped(margins[event.name], lattice)
             known[place] = tile.cropped(margins.known, lattice)
     step, obstacle, tilt, *optional = found
-    return Margins(step, obstacle, tilt, known, tuple(optional), chosen.event_names)  # type: ignore[arg-type]
+    return Margins(step, obstacle, tilt, known, tuple(optional), setup.robot.event_names)  # type: ignore[arg-type]
 
 
 def contact_of(robot: Robot, contact: str | None) -> str:

@@ -50,6 +50,28 @@ class Primitive:
         return np.concatenate(along)
 
 
+@dataclass(frozen=True)
+class PointTurn:
+    """A turn on the spot at a place of the site, of which some poses are simulated.
+
+    heading: radians, anticlockwise from +y, at its start
+    angle:   radians that it turns by, positive to the left
+    parts:   equal parts between poses; 0 parts are one pose, the robot standing there
+
+    Its step margin is that between poses, and says nothing: wheels that turn on the spot scrub, they do not climb.
+    """
+
+    heading: float
+    angle: float = 0.0
+    parts: int = 0
+
+    def poses(self, interval: float) -> Float[np.ndarray, "p 3"]:
+        """Returns the simulated poses, counted from the place: x and y in metres, and the heading in radians."""
+        poses = np.zeros((self.parts + 1, 3))
+        poses[:, 2] = self.heading + np.linspace(0, self.angle, self.parts + 1)
+        return poses
+
+
 def straight_passes(headings: int = 16, stride: float = 0.25) -> tuple[Primitive, ...]:
     """Returns the straight drive through a place in each of the headings, half a stride before and behind it.
 
@@ -61,7 +83,7 @@ def straight_passes(headings: int = 16, stride: float = 0.25) -> tuple[Primitive
     return tuple(Primitive(2 * math.pi * h / headings, ((math.inf, stride),), stride / 2) for h in range(headings))
 
 
-def all_poses(primitives: tuple[Primitive, ...], interval: float) -> Float[np.ndarray, "f p 3"]:
+def all_poses(primitives: tuple[Primitive | PointTurn, ...], interval: float) -> Float[np.ndarray, "f p 3"]:
     """Returns the poses of primitives; those of a shorter one end with repetitions of its last one."""
     paths = [primitive.poses(interval) for primitive in primitives]
     longest = max(map(len, paths))

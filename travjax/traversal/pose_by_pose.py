@@ -75,21 +75,37 @@ def traverse(
     path = setup.actions.poses(trajectory)
     if setup.contact.model == "tyre":
         turning = tyre_reference.turn_poses(setup.actions, trajectory)[:-1] if setup.contact.turn else path[:0]
-        return _by_tyre(ground, setup, np.concatenate([turning, path]), len(turning))
-    return _by_nearest(ground, setup, path)
+        return at_poses(ground, np.concatenate([turning, path]), setup.robot, grid.spacing, "tyre", len(turning))
+    return at_poses(ground, path, setup.robot, grid.spacing, "nearest")
 
 
-def _by_nearest(ground: np.ndarray, setup: Setup, poses: np.ndarray) -> Traverse:
-    robot, spacing = setup.robot, setup.grid.spacing
+def at_poses(
+    ground: Float[np.ndarray, "rows cols"],
+    poses: Float[np.ndarray, "p 3"],
+    robot: Robot,
+    spacing: float,
+    contact: str,
+    turning: int = 0,
+) -> Traverse:
+    """Simulates any poses that follow each other, and returns what happens at each of them.
+
+    ground:  [rows, cols] float64 metres, both odd, the middle node at x = y = 0; NaN where unknown
+    poses:   x, y and heading; turning: how many of the first belong to a point turn
+    spacing: metres between nodes; contact: contact model
+    """
+    by = _by_tyre if contact == "tyre" else _by_nearest
+    return by(ground, poses, robot, spacing, turning)
+
+
+def _by_nearest(ground: np.ndarray, poses: np.ndarray, robot: Robot, spacing: float, turning: int) -> Traverse:
     states = [reference.pose_state(ground, robot, x, y, heading, spacing) for x, y, heading in poses.tolist()]
     contact = np.array([state.contacts for state in states])
     change = np.abs(np.diff(contact, axis=0, prepend=contact[:1]))
     step_node = np.take_along_axis(np.array([s.nodes for s in states]), change.argmax(axis=1)[:, None, None], axis=1)
-    return _traverse(states, poses, 0, contact, change.max(axis=1), step_node[:, 0])
+    return _traverse(states, poses, turning, contact, change.max(axis=1), step_node[:, 0])
 
 
-def _by_tyre(ground: np.ndarray, setup: Setup, poses: np.ndarray, turning: int) -> Traverse:
-    robot, spacing = setup.robot, setup.grid.spacing
+def _by_tyre(ground: np.ndarray, poses: np.ndarray, robot: Robot, spacing: float, turning: int) -> Traverse:
     whole = tyre_reference.ground_of(ground, robot, spacing)
     states = [tyre_reference.pose_state(whole, robot, x, y, heading, spacing) for x, y, heading in poses.tolist()]
     contact, step = np.array([state.resting for state in states]), np.array([state.step for state in states])

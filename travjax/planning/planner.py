@@ -1,0 +1,182 @@
+"""The planner: from here to there on a site, or what stands in the way (SPEC section 14)."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from travjax.config import InputError, require_number, shown
+from travjax.jax_flags import usual_flags
+from travjax.planning.costs import MotionCosts
+from travjax.planning.endpoints import Endpoint, endpoint, standing, why_not_standing
+from travjax.planning.motions import MotionLattice, Motions
+from travjax.planning.no_path import NoPathError, no_path
+from travjax.planning.path import Leg, Path, drive
+from travjax.planning.search import Search, bounds
+from travjax.simulation.robot import Robot
+from travjax.simulation.setup import chosen_robot
+from travjax.site.ground import Site, open_site
+from travjax.site.kernel import SiteSetup, contact_of
+from travjax.site.primitives import PointTurn
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A path that the robot survives, and how it was found.
+
+    path:   its poses, each simulated once more by the sequential simulators
+    legs:   the motions that it is made of
+    cost:   as of Motions, the least that these motions allow
+    points: where it begins, passes and ends, on the lattice
+    checks: what the sequential simulators said: poses simulated, poses that exceed a limit, poses on unknown ground,
+            and motions that were refused before
+    """
+
+    path: Path
+    legs: tuple[Leg, ...]
+    cost: float
+    points: tuple[Endpoint, ...]
+    checks: Mapping[str, int]
+
+
+class Planner:
+    """Plans paths on one site; what was computed for one is kept for the next."""
+
+    def __init__(
+        self,
+        ground: Site,
+        robot: Robot | str | None = None,
+        motions: Motions | None = None,
+        *,
+        headings: int = 16,
+        stride: float | None = None,
+        contact: str | None = None,
+        interval: float = 0.06,
+        unknown_cost: float | None = None,
+    ):
+        """See `plan`."""
+        chosen, spacing = chosen_robot(robot), ground.spacing
+        places = SiteSetup.usual_stride(spacing) if stride is None else stride
+        if unknown_cost is not None:
+            require_number("unknown_cost", unknown_cost, np.nextafter(1, 0), 1e6, "a factor of at least 1")
+        lattice = MotionLattice(motions or Motions(), headings, places)
+        standing_still = (PointTurn(0.0),)
+        self.setup = SiteSetup(chosen, standing_still, spacing, places, interval, contact_of(chosen, contact))
+        self.costs = MotionCosts(ground, self.setup, lattice, unknown_cost)
+
+    @property
+    def lattice(self) -> MotionLattice:
+        """States and motions."""
+        return self.costs.lattice
+
+    @usual_flags()
+    def plan(self, start: Any, goal: Any, via: Sequence[Any] = (), coordinates: str = "site") -> Plan:
+        """Plans a path; see `plan`."""
+        names = ["start", *(f"via {number}" for number in range(1, len(via) + 1)), "goal"]
+        given = zip(names, (start, *via, goal), strict=True)
+        points = [endpoint(name, point, self.costs, coordinates) for name, point in given]
+        if not standing(points[0], self.costs):
+            raise InputError(f"start = {shown(points[0].given)}: {why_not_standing(points[0], self.costs)}")
+        refused = 0
+        while True:
+            legs, cost, first = self._cheapest(points)
+            pose = first % self.lattice.headings
+            at = np.array(
+                [points[0].col * self.setup.stride, points[0].row * self.setup.stride, self.lattice.angles[pose]]
+            )
+            path, owner = drive(legs, at, self.costs.ground, self.setup)
+            bad = path.exceeds | (~path.known & (self.costs.unknown_cost is None))
+            if not bad.any() or not legs:
+                break
+            for number in {owner[row] for row in np.flatnonzero(bad)}:
+                self.costs.block(legs[number])
+                refused += 1
+        checks = {
+            "poses simulated": len(path.z),
+            "poses that exceed a limit": int(path.exceeds.sum()),
+            "poses on unknown ground": int((~path.known).sum()),
+            "motions refused before": refused,
+        }
+        return Plan(path, tuple(legs), cost, tuple(points), checks)
+
+    def _cheapest(self, points: Sequence[Endpoint]) -> tuple[list[Leg], float, int]:
+        """Returns the motions of the cheapest path, its cost, and the state where it begins."""
+        starts = dict.fromkeys(standing(points[0], self.costs), 0.0)
+        searches, goals = [], []
+        for here, there in zip(points, points[1:], strict=False):
+            goals = standing(there, self.costs)
+            if not goals:
+                error = no_path(here, there, self.costs)
+                why = f"{there.name} = {shown(there.given)}: {why_not_standing(there, self.costs)}"
+                raise NoPathError(why, error.reached, here, there)
+            bound = bounds(self.lattice, self.costs.easiest, [there.row * self.costs.shape[1] + there.col])
+            search = Search(self.lattice.moves, self.lattice.headings, bound)
+            for state, cost in starts.items():
+                search.start(state, cost)
+            if not search.run(self.costs, goals, every=there is not points[-1]):
+                raise no_path(here, there, self.costs, search)
+            starts = {goal: float(search.best[goal]) for goal in goals if search.closed[goal]}
+            searches.append(search)
+        state = min(starts, key=lambda goal: starts[goal])
+        cost, legs = starts[state], list[Leg]()
+        for search in reversed(searches):
+            steps = search.path_to(state)
+            legs[:0] = [self._leg(*step) for step in steps]
+            state = steps[0][0] if steps else state
+        return legs, cost, state
+
+    def _leg(self, state: int, heading: int, step: int) -> Leg:
+        """Returns the motion of a step of the search."""
+        moves = self.lattice.moves
+        row, col = divmod(state // self.lattice.headings, self.costs.shape[1])
+        begins = row + int(moves.from_rows[heading, step]), col + int(moves.from_cols[heading, step])
+        return Leg(*begins, self.lattice.all[moves.motion[heading, step]], bool(moves.backwards[heading, step]))
+
+
+def plan(
+    site: str | FilePath | Site | Float[np.ndarray, "rows cols"],
+    start: Any,
+    goal: Any,
+    robot: Robot | str | None = None,
+    *,
+    via: Sequence[Any] = (),
+    motions: Motions | None = None,
+    headings: int = 16,
+    stride: float | None = None,
+    spacing: float | None = None,
+    contact: str | None = None,
+    interval: float = 0.06,
+    unknown_cost: float | None = None,
+    coordinates: str = "site",
+) -> Plan:
+    """Plans the cheapest path that a robot survives, and simulates each of its poses once more.
+
+    site:        an elevation map that `load_dem` reads, a `SiteGround`, or heights [rows, cols] in metres, row 0 south
+    start, goal: (x, y) or (x, y, heading), radians anticlockwise from +y (north); any heading unless given. The path
+                 begins and ends at the nearest places of a lattice and in the nearest of its headings
+    robot:       a Robot, or the name or file of one; the Seekur Jr unless given
+    via:         points to pass in this order
+    motions:     what the robot may do, and what that costs
+    headings:    number of headings, evenly around the circle; stride: metres between places (0.25); spacing: metres
+                 between nodes (0.0625); interval: metres between simulated poses
+    contact:     contact model, "tyre" or "nearest"; that of the robot's file unless given, or else "tyre"
+    unknown_cost: how many times as much as the worst safe ground unknown ground costs; it is not driven on unless given
+    coordinates: what points are: "site" (x and y), "latlon" (degrees of latitude and longitude) or "rowcol" (row and
+                 column of nodes, counted from the south-west)
+    Source: SPEC section 14. Raises NoPathError where there is no path, and InputError as `map_site` does, for points
+    off the site, and where the robot cannot stand at the start.
+    """
+    planner = Planner(
+        open_site(site, spacing),
+        robot,
+        motions,
+        headings=headings,
+        stride=stride,
+        contact=contact,
+        interval=interval,
+        unknown_cost=unknown_cost,
+    )
+    return planner.plan(start, goal, via, coordinates)
