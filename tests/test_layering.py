@@ -21,7 +21,7 @@ LAYERS = {
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
     "site": "primitives ground kernel costs tiling geotiff nav2 store site_figures mapping geometric site_benchmark",
-    "planning": "biarcs motions path costs endpoints search no_path planner",
+    "planning": "biarcs motions path costs endpoints search no_path planner to_go plan_figures plan_report",
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
@@ -29,7 +29,7 @@ LAYERS = {
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
     "timing comparison physics",
-    "commands": "terrain label map dataset weights train evaluate export predict physics bench",
+    "commands": "terrain label map plan dataset weights train evaluate export predict physics bench",
     "program": "cli",
 }
 """Packages from the bottom to the top, those of TOP being travjax itself; in each, its modules likewise."""

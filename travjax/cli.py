@@ -4,22 +4,35 @@ import argparse
 from collections.abc import Sequence
 
 import travjax
-from travjax.commands import bench, dataset, evaluate, export, label, map, physics, predict, terrain, train, weights
+from travjax.commands import (
+    bench,
+    dataset,
+    evaluate,
+    export,
+    label,
+    map,
+    physics,
+    plan,
+    predict,
+    terrain,
+    train,
+    weights,
+)
 from travjax.config import naming
 from travjax.entry import Parser, guarded, use_compilation_cache
 
-COMMANDS = (terrain, label, map, dataset, weights, train, evaluate, export, predict, physics, bench)
+COMMANDS = (terrain, label, map, plan, dataset, weights, train, evaluate, export, predict, physics, bench)
 """The commands in the order in which the help lists them."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code, 2 for bad input."""
+    """Runs one command; returns the exit code: 2 for bad input, 1 where `plan` finds no path."""
 
-    def work() -> None:
+    def work() -> int | None:
         arguments = _parser().parse_args(argv)
         use_compilation_cache()
         with naming(arguments.command):
-            arguments.run(arguments)
+            return arguments.run(arguments)
 
     return guarded(work)
 

@@ -53,15 +53,15 @@ def _settled(stream: IO[str] | None, number: int) -> IO[str]:
     return stream
 
 
-def guarded(work: Callable[[], object]) -> int:
-    """Runs a program; returns the exit code, 2 for bad input, which is reported in one line."""
+def guarded(work: Callable[[], int | None]) -> int:
+    """Runs a program; returns its exit code, 0 for None, and 2 for bad input, which is reported in one line."""
     settle_streams()
     with signals.raised():
         try:
             from travjax.jax_flags import usual_flags  # imports JAX, which takes a second
 
             with usual_flags():
-                work()
+                code = work()
             sys.stdout.flush()
         except InputError as error:
             return _ended(2, str(error))
@@ -77,7 +77,7 @@ def guarded(work: Callable[[], object]) -> int:
         except KeyboardInterrupt as error:
             warnings.simplefilter("ignore")  # Python warns about interrupted coroutines
             return _ended(*signals.ending(error))
-    return 0
+    return code or 0
 
 
 def _ended(code: int, line: str) -> int:

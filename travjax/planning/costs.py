@@ -31,6 +31,7 @@ class MotionCosts:
 
     cost:         [places, motions] as of Motions, inf where the robot fails or the ground is unknown
     in_the_way:   [places, motions] 0 for nothing, 1, 2, 3 ... for the robot's event of this number, or UNKNOWN
+    refused:      how many motions were forbidden by `block`
     evaluated:    [tile rows, tile cols] of tiles of `tile` places a side, whether these are known
     unknown_cost: how many times as much as the worst safe ground unknown ground costs, at least 1; None where it is
                   not driven on
@@ -45,6 +46,7 @@ class MotionCosts:
         self.in_the_way = np.empty((places, len(lattice.all)), np.uint8)
         self.evaluated = np.zeros(tuple(-(-count // TILE) for count in self.shape), bool)
         self._setups = _setups(setup, lattice)
+        self.refused = 0
         self._pool = ThreadPoolExecutor(workers())
         self._standing = replace(setup, primitives=tuple(PointTurn(angle) for angle in lattice.angles.tolist()))
 
@@ -73,6 +75,7 @@ class MotionCosts:
 
     def block(self, leg: Leg) -> None:
         """Forbids a motion that the sequential simulators refuse."""
+        self.refused += 1
         self.cost[leg.row * self.shape[1] + leg.col, self.lattice.all.index(leg.motion)] = np.inf
 
     def _evaluate(self, at: tuple[int, int]) -> tuple[int, int]:

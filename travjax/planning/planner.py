@@ -1,6 +1,6 @@
 """The planner: from here to there on a site, or what stands in the way (SPEC section 14)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
@@ -21,6 +21,9 @@ from travjax.simulation.setup import chosen_robot
 from travjax.site.ground import Site, open_site
 from travjax.site.kernel import SiteSetup, contact_of
 from travjax.site.primitives import PointTurn
+
+Found = tuple[list[Leg], float, int]
+"""Motions of a path, its cost, and the state where it begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,31 +81,35 @@ class Planner:
         names = ["start", *(f"via {number}" for number in range(1, len(via) + 1)), "goal"]
         given = zip(names, (start, *via, goal), strict=True)
         points = [endpoint(name, point, self.costs, coordinates) for name, point in given]
-        if not standing(points[0], self.costs):
-            raise InputError(f"start = {shown(points[0].given)}: {why_not_standing(points[0], self.costs)}")
-        refused = 0
+        self.require_standing(points[0])
+        return self.checked(points, lambda: self.cheapest(points))
+
+    def require_standing(self, start: Endpoint) -> None:
+        """Raises InputError that says why the robot cannot stand at the start of a path, and where it could."""
+        if not standing(start, self.costs):
+            raise InputError(f"{start.name} = {shown(start.given)}: {why_not_standing(start, self.costs)}")
+
+    def checked(self, points: Sequence[Endpoint], find: Callable[[], Found]) -> Plan:
+        """Finds motions, simulates their poses once more, and goes on without those that the simulators refuse."""
+        before, start, stride = self.costs.refused, points[0], self.setup.stride
         while True:
-            legs, cost, first = self._cheapest(points)
-            pose = first % self.lattice.headings
-            at = np.array(
-                [points[0].col * self.setup.stride, points[0].row * self.setup.stride, self.lattice.angles[pose]]
-            )
+            legs, cost, first = find()
+            at = np.array([start.col * stride, start.row * stride, self.lattice.angles[first % self.lattice.headings]])
             path, owner = drive(legs, at, self.costs.ground, self.setup)
             bad = path.exceeds | (~path.known & (self.costs.unknown_cost is None))
             if not bad.any() or not legs:
                 break
             for number in {owner[row] for row in np.flatnonzero(bad)}:
                 self.costs.block(legs[number])
-                refused += 1
         checks = {
             "poses simulated": len(path.z),
             "poses that exceed a limit": int(path.exceeds.sum()),
             "poses on unknown ground": int((~path.known).sum()),
-            "motions refused before": refused,
+            "motions refused before": self.costs.refused - before,
         }
         return Plan(path, tuple(legs), cost, tuple(points), checks)
 
-    def _cheapest(self, points: Sequence[Endpoint]) -> tuple[list[Leg], float, int]:
+    def cheapest(self, points: Sequence[Endpoint]) -> Found:
         """Returns the motions of the cheapest path, its cost, and the state where it begins."""
         starts = dict.fromkeys(standing(points[0], self.costs), 0.0)
         searches, goals = [], []
@@ -124,13 +131,13 @@ class Planner:
         cost, legs = starts[state], list[Leg]()
         for search in reversed(searches):
             steps = search.path_to(state)
-            legs[:0] = [self._leg(*step) for step in steps]
+            legs[:0] = [self.leg(search, *step) for step in steps]
             state = steps[0][0] if steps else state
         return legs, cost, state
 
-    def _leg(self, state: int, heading: int, step: int) -> Leg:
-        """Returns the motion of a step of the search."""
-        moves = self.lattice.moves
+    def leg(self, search: Search, state: int, heading: int, step: int) -> Leg:
+        """Returns the motion of a step of a search from a state."""
+        moves = search.moves
         row, col = divmod(state // self.lattice.headings, self.costs.shape[1])
         begins = row + int(moves.from_rows[heading, step]), col + int(moves.from_cols[heading, step])
         return Leg(*begins, self.lattice.all[moves.motion[heading, step]], bool(moves.backwards[heading, step]))

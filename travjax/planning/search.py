@@ -40,8 +40,10 @@ class Costs(Protocol):
 class Search:
     """A search on a lattice of places; rows, cols: of the places.
 
-    bound: [rows, cols] of each place to the goals, at most what a path costs; inf where there is none
-    best:  [states] cost of the cheapest path to a state found so far, inf for none
+    bound:   [rows, cols] of each place to the goals, at most what a path costs; inf where there is none
+    best:    [states] cost of the cheapest path to a state found so far, inf for none
+    closed:  [states] whether that is the cheapest path of all
+    arrived: [states] number of the step that it ends with, heading * M + step, or NOWHERE
     """
 
     def __init__(self, moves: Moves, headings: int, bound: Float[np.ndarray, "rows cols"]):
@@ -50,7 +52,7 @@ class Search:
         states = self.bound.size * headings
         self.best = np.full(states, np.inf)
         self.closed = np.zeros(states, bool)
-        self._arrived = np.full(states, NOWHERE, np.uint16)
+        self.arrived = np.full(states, NOWHERE, np.uint16)
         self._heap = np.empty(1024), np.empty(1024, np.int64)
         self._size = 0
 
@@ -78,15 +80,18 @@ class Search:
             fields = tuple(vars(self.moves).values())[:7]
             shape = self.rows, self.cols, self.headings
             ended, place, *self._heap, self._size = _advance(
-                *self._heap, self._size, self.best, self._arrived, self.closed, self.bound.ravel(), costs.cost,
+                *self._heap, self._size, self.best, self.arrived, self.closed, self.bound.ravel(), costs.cost,
                 costs.evaluated, costs.tile, fields, shape, wanted, left,
             )  # fmt: skip
             if ended != MISSING:
                 return int(self.closed[chosen].sum())
-            costs.evaluate(self._towards_goals(place))
+            costs.evaluate(self._next_places(place, costs.tile))
 
-    def _towards_goals(self, place: int) -> Iterator[int]:
-        """Yields a place, and places on the way from there to the goals for a robot that needs no heading."""
+    def _next_places(self, place: int, tile: int) -> Iterator[int]:
+        """Yields a place, and where the search probably needs costs soon.
+
+        These are places on the way to the goals of a robot that needs no heading, or around if the bound knows no way.
+        """
         yield place
         while 0 < self.bound.flat[place] < np.inf:
             row, col = divmod(place, self.cols)
@@ -98,10 +103,14 @@ class Search:
                 return
             place = next_place
             yield place
+        row, col = divmod(place, self.cols)
+        for rows, cols in ((0, tile), (tile, 0), (0, -tile), (-tile, 0)):
+            if 0 <= row + rows < self.rows and 0 <= col + cols < self.cols:
+                yield place + rows * self.cols + cols
 
     def step_to(self, state: int) -> tuple[int, int, int] | None:
         """Returns how the cheapest path arrives in a state: state before, its heading's step; None where it begins."""
-        arrived = int(self._arrived[state])
+        arrived = int(self.arrived[state])
         if arrived == NOWHERE:
             return None
         place, _ = divmod(state, self.headings)

@@ -26,12 +26,12 @@ def passable_figure(
 
     heights, bands, costs: of a site, row 0 in the north; what: lines for the title
     """
-    every = _every(heights.shape)
+    every = shown_every(heights.shape)
     ways, known = (np.asarray(bands[f"{name}_headings"][::every, ::every]) for name in ("passable", "known"))
     colours = SAFE, DOUBTFUL, FAILED, UNKNOWN_COLOUR
-    figure, ax, side = _frame_of(heights, frame, what)
-    _draw(ax, heights, kinds_of(ways, known), colours, frame, every)
-    _legend(side, dict(zip(KINDS, colours, strict=True)), "passable in")
+    figure, ax, side = map_figure(heights, frame, what)
+    draw_kinds(ax, heights, kinds_of(ways, known), colours, frame, every)
+    draw_legend(side, dict(zip(KINDS, colours, strict=True)), "passable in")
     place = _telling_place(bands, every)
     if place is not None:
         x = frame.origin[0] + place[1] * frame.cell_size
@@ -45,20 +45,22 @@ def blocking_figure(
     heights: np.ndarray, bands: Mapping[str, np.ndarray], frame: Frame, events: Sequence[str], what: Sequence[str]
 ) -> Figure:
     """Draws which event exceeds its limit most, over the known headings of each place."""
-    every = _every(heights.shape)
+    every = shown_every(heights.shape)
     code = np.asarray(bands["blocking_event"][::every, ::every])
     colours = (*EVENT_COLOURS[: len(events) + 1], UNKNOWN_COLOUR)
-    figure, ax, side = _frame_of(heights, frame, what)
-    _draw(ax, heights, np.where(np.isnan(code), len(events) + 1, code), colours, frame, every)
-    _legend(side, dict(zip(("none", *events, "unknown"), colours, strict=True)), "blocked by, in some direction")
+    figure, ax, side = map_figure(heights, frame, what)
+    draw_kinds(ax, heights, np.where(np.isnan(code), len(events) + 1, code), colours, frame, every)
+    draw_legend(side, dict(zip(("none", *events, "unknown"), colours, strict=True)), "blocked by, in some direction")
     return figure
 
 
-def _every(shape: tuple[int, ...]) -> int:
+def shown_every(shape: tuple[int, ...]) -> int:
+    """Returns how many places along an edge share a pixel."""
     return -(-max(shape) // MOST)
 
 
-def _frame_of(heights: np.ndarray, frame: Frame, what: Sequence[str]):
+def map_figure(heights: np.ndarray, frame: Frame, what: Sequence[str]):
+    """Returns a figure with axes for the map, and beside it axes for what explains it."""
     rows, cols = heights.shape
     tall = float(np.clip(6.4 * rows / cols, 3.2, 9.0))
     figure = Figure(figsize=(9.2, tall + 1.3))
@@ -69,8 +71,15 @@ def _frame_of(heights: np.ndarray, frame: Frame, what: Sequence[str]):
     return figure, ax, side
 
 
-def _draw(ax, heights: np.ndarray, kind: np.ndarray, colours: Sequence[str], frame: Frame, every: int) -> None:
+def draw_kinds(ax, heights: np.ndarray, kind: np.ndarray, colours: Sequence[str], frame: Frame, every: int) -> None:
     """Draws kinds in their colours over a hillshade, with a scale bar and north."""
+    extent = draw_hillshade(ax, heights, frame, every)
+    kinds: Any = dict(cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5, interpolation="nearest")
+    ax.imshow(kind, extent=extent, alpha=0.62, **kinds)
+
+
+def draw_hillshade(ax, heights: np.ndarray, frame: Frame, every: int) -> tuple[float, float, float, float]:
+    """Draws the ground [rows, cols], row 0 in the north, with a scale bar and north; returns the image's extent."""
     rows, cols = heights.shape
     half, (x, y) = frame.cell_size / 2, frame.origin
     east, north = x + (cols - 1) * frame.cell_size, y + (rows - 1) * frame.cell_size
@@ -82,12 +91,11 @@ def _draw(ax, heights: np.ndarray, kind: np.ndarray, colours: Sequence[str], fra
     if min(shown.shape) > 1:
         shade = LightSource(315, 45).hillshade(np.nan_to_num(shown, nan=level), dx=cell, dy=cell)
     ax.imshow(shade, extent=extent, cmap="gray", vmin=0, vmax=1)
-    kinds: Any = dict(cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5, interpolation="nearest")
-    ax.imshow(kind, extent=extent, alpha=0.62, **kinds)
     ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
     ax.ticklabel_format(useOffset=False, style="plain")
     ax.tick_params(labelsize=8)
     _scale_bar(ax, extent)
+    return extent
 
 
 def _scale_bar(ax, extent: tuple[float, float, float, float]) -> None:
@@ -105,7 +113,8 @@ def _scale_bar(ax, extent: tuple[float, float, float, float]) -> None:
     ax.annotate("", (0.95, 0.95), (0.95, 0.88), xycoords="axes fraction", arrowprops=arrow)
 
 
-def _legend(side, entries: Mapping[str, str], title: str) -> None:
+def draw_legend(side, entries: Mapping[str, str], title: str) -> None:
+    """Draws names and colours of kinds."""
     edge: Any = dict(edgecolor="black", linewidth=0.5)
     patches = [Patch(facecolor=colour, label=name, **edge) for name, colour in entries.items()]
     side.legend(handles=patches, title=title, loc="upper left", fontsize=8, title_fontsize=8, frameon=False)

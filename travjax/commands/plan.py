@@ -1,0 +1,127 @@
+"""`travjax plan`: a path that a robot survives, or what stands in its way."""
+
+import argparse
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from travjax import options, progress
+from travjax.config import require
+from travjax.files import user_path
+from travjax.rasters.formats import OTHERS
+
+NO_PATH = 1
+"""Exit code where there is no path."""
+
+
+def add(commands: options.Commands) -> None:
+    """Adds the command's parser."""
+    parser = commands.add_parser(
+        "plan",
+        help="plan a path that a robot survives, or tell what stands in its way",
+        description="Plans the cheapest path between points of a site: drives and point turns whose margins are exact, "
+        "each pose simulated once more in the end. Writes the path and a figure; without a path, the reason, a figure "
+        f"and exit code 1. A site is an elevation map: GeoTIFF or another raster that GDAL reads, {OTHERS}.",
+    )
+    parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
+    numbers: Any = dict(nargs="+", type=float, metavar=("X Y", "DEG"))
+    where = "x and y of the site, and the heading in degrees anticlockwise from +y (north) if it matters"
+    parser.add_argument("--from", dest="start", help=f"where the path begins: {where}", **numbers)
+    parser.add_argument("--to", dest="goal", required=True, help="where it ends, likewise", **numbers)
+    parser.add_argument(
+        "--via", action="append", default=[], help="a point to pass, likewise; may be given again", **numbers
+    )
+    parser.add_argument(
+        "--coordinates",
+        choices=("site", "latlon", "rowcol"),
+        default="site",
+        help="what points are: x and y (site), latitude and longitude in degrees (latlon), or row and column of nodes, "
+        "counted from the south-west (rowcol)",
+    )
+    options.add_robot_alone(parser)
+    options.add_contact_model(parser, "tyre")
+    parser.add_argument(
+        "--primitives", type=user_path, metavar="FILE", help=".toml file of what the robot may do and what that costs"
+    )
+    parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
+    parser.add_argument(
+        "--stride",
+        type=float,
+        metavar="M",
+        help="metres between places (0.25, or as many cells as make that up)",
+    )
+    parser.add_argument(
+        "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
+    )
+    parser.add_argument(
+        "--interval", type=float, default=0.06, metavar="M", help="metres between simulated poses (0.06)"
+    )
+    parser.add_argument(
+        "--unknown-cost",
+        type=float,
+        metavar="K",
+        help="drive over unknown ground, at K times the cost of the worst safe ground (never)",
+    )
+    parser.add_argument(
+        "--to-go",
+        action="store_true",
+        help="also write the cost to go to the goal from everywhere",
+    )
+    options.add_reading(parser)
+    options.add_out(parser, "runs/plan")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Plans the path and writes the results; returns the exit code."""
+    from travjax.planning.motions import Motions
+    from travjax.planning.no_path import NoPathError
+    from travjax.planning.plan_report import save_no_path, save_plan, save_to_go
+    from travjax.planning.planner import Planner
+    from travjax.planning.to_go import CostToGo
+    from travjax.simulation.contact import spacing_note
+    from travjax.site.ground import SiteGround
+    from travjax.site.mapping import coarse_note
+
+    goal, via = _point("--to", arguments.goal), [_point("--via", point) for point in arguments.via]
+    require(arguments.start or arguments.to_go, "--from", None, "given, unless --to-go is")
+    start = _point("--from", arguments.start) if arguments.start else None
+    require(start is not None or not via, "--via", arguments.via, "left out where --from is")
+    motions = Motions.load(arguments.primitives) if arguments.primitives else None
+    site = SiteGround.open(
+        arguments.site,
+        arguments.spacing,
+        reading=options.reading(arguments),
+        fill_holes=not arguments.keep_holes,
+        allow_coarse=arguments.allow_coarse,
+    )
+    planner = Planner(
+        site,
+        arguments.robot,
+        motions,
+        headings=arguments.headings,
+        stride=arguments.stride,
+        contact=arguments.contact,
+        interval=arguments.interval,
+        unknown_cost=arguments.unknown_cost,
+    )
+    setup = planner.setup
+    for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
+        if line:
+            progress.say(f"{arguments.site}: {line}")
+    try:
+        if arguments.to_go:
+            save_to_go(CostToGo(planner, goal, arguments.coordinates), arguments.out)
+        if start is not None:
+            save_plan(planner.plan(start, goal, via, arguments.coordinates), planner, arguments.out)
+    except NoPathError as error:
+        save_no_path(error, planner, arguments.out)
+        return NO_PATH
+    return 0
+
+
+def _point(option: str, numbers: Sequence[float]) -> tuple[float, ...]:
+    """Returns a point with its heading in radians."""
+    require(len(numbers) in (2, 3), option, list(numbers), "X Y, or X Y DEG with the heading")
+    x, y, *heading = numbers
+    return x, y, *(math.radians(angle) for angle in heading)

@@ -1,0 +1,84 @@
+"""Plans on disk: tables, files for other tools and figures, in one folder."""
+
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from travjax import progress
+from travjax.config import one_line
+from travjax.evaluation import map_figures
+from travjax.evaluation.tables import rows_table
+from travjax.files import held, output_folder, save_text
+from travjax.planning.no_path import NoPathError
+from travjax.planning.plan_figures import no_path_figure, plan_figure, to_go_figure
+from travjax.planning.planner import Plan, Planner
+from travjax.planning.to_go import CostToGo
+from travjax.simulation.events import EVENTS
+from travjax.site.geotiff import Frame, save_geotiff
+
+
+def save_plan(plan: Plan, planner: Planner, out: str | FilePath) -> FilePath:
+    """Writes path.csv, plan.png and plan.txt, prints what the plan is, and returns the folder."""
+    path, robot = plan.path, planner.setup.robot
+    limits = dict(zip(robot.event_names, robot.limits, strict=True))
+    largest = {name: float(np.nanmax(getattr(path, name), initial=0)) for name in EVENTS}
+    rows = [
+        {"event": name, "largest margin": _shown(name, largest[name]), "limit": _shown(name, limits[name])}
+        for name in EVENTS
+    ]
+    lines = [_heading(planner), f"path of {path.length:.2f} m, cost {plan.cost:.2f}", rows_table(rows)]
+    lines += [f"{what}: {count}" for what, count in plan.checks.items()]
+    progress.say("\n".join(lines))
+    with held(folder := output_folder(out)):
+        figure = plan_figure(plan, planner, (lines[0], lines[1]))
+        written = [
+            map_figures.save(figure, folder / "plan.png"),
+            save_text(folder / "plan.txt", "\n".join(lines) + "\n"),
+        ]
+    progress.wrote(*written)
+    return folder
+
+
+def save_no_path(error: NoPathError, planner: Planner, out: str | FilePath) -> FilePath:
+    """Writes no_path.png and no_path.txt, prints the reason, and returns the folder."""
+    progress.say(one_line(error))
+    with held(folder := output_folder(out)):
+        figure = no_path_figure(
+            error, planner, (_heading(planner), f"no path from {error.start.name} to {error.goal.name}")
+        )
+        written = [
+            map_figures.save(figure, folder / "no_path.png"),
+            save_text(folder / "no_path.txt", f"{error}\n"),
+        ]
+    progress.wrote(*written)
+    return folder
+
+
+def save_to_go(to_go: CostToGo, out: str | FilePath) -> FilePath:
+    """Writes to_go.tif and to_go.png, and returns the folder."""
+    planner, best = to_go.planner, to_go.best
+    goal, reached = to_go.goal, np.isfinite(best)
+    heading = f"{_heading(planner)}\ncost to go to ({goal.x:.2f}, {goal.y:.2f}): from {reached.mean():.1%} of places"
+    progress.say(heading)
+    ground, setup = planner.costs.ground, planner.setup
+    bands = np.stack([np.where(reached, best, np.nan), np.degrees(to_go.direction)]).astype(np.float32)[:, ::-1]
+    tags = {"robot": setup.robot.name, "contact": setup.contact, "goal": f"{goal.x} {goal.y}"}
+    names = ("cost_to_go", "direction_deg")
+    with held(folder := output_folder(out)):
+        written = [
+            save_geotiff(
+                folder / "to_go.tif", bands, names, Frame(ground.origin, setup.stride, ground.crs), float("nan"), tags
+            ),
+            map_figures.save(to_go_figure(to_go, heading.split("\n")), folder / "to_go.png"),
+        ]
+    progress.wrote(*written)
+    return folder
+
+
+def _heading(planner: Planner) -> str:
+    setup, lattice = planner.setup, planner.lattice
+    return f"{setup.robot.name}, {setup.contact}, {lattice.headings} headings, places {lattice.stride:g} m apart"
+
+
+def _shown(event: str, margin: float) -> str:
+    return f"{np.degrees(margin):.1f} deg" if event == "tilt" else f"{margin:.3f} m"
