@@ -7,6 +7,7 @@ from .models.input_images import render_inputs
 from .planning.motions import Motions
 from .planning.no_path import NoPathError
 from .planning.planner import Plan, Planner, plan
+from .planning.to_go import CostToGo
 from .runs.predictor import Predictor, predict
 from .runs.run import load_estimator
 from .simulation.actions import ActionSpace
@@ -29,6 +30,7 @@ __all__ = [
     "EVENTS",
     "STYLES",
     "ActionSpace",
+    "CostToGo",
     "Grid",
     "InputError",
     "Margins",

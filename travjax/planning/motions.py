@@ -56,7 +56,7 @@ class Motions:
     point_turns: bool = True
     reverse: bool = False
     turning: float = 0.3
-    risk: float = 1.0
+    risk: float = 4.0
     reversing: float = 2.0
 
     def __post_init__(self):
