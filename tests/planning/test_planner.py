@@ -74,7 +74,9 @@ def test_heights_of_the_path_are_those_of_the_site():
     y = np.arange(NODES)[:, None] * SPACING
     found = planner(np.broadcast_to(0.1 * y + 712.0, (NODES, NODES))).plan(START, GOAL)
     np.testing.assert_allclose(found.path.z, 712 + 0.1 * found.path.pose[:, 1], atol=0.1 * SPACING)
-    assert np.degrees(found.path.tilt).max() == pytest.approx(math.degrees(math.atan(0.1)), abs=1.2)  # wheels go by the nearest node
+    assert np.degrees(found.path.tilt).max() == pytest.approx(
+        math.degrees(math.atan(0.1)), abs=1.2
+    )  # wheels go by the nearest node
 
 
 def test_a_given_heading_is_kept_at_both_ends():
@@ -160,7 +162,9 @@ def test_a_goal_that_headings_bar_is_told_apart_from_one_that_nothing_reaches():
 
 
 def test_a_start_that_fails_is_refused_with_the_nearest_that_works():
-    with pytest.raises(InputError, match=r"start = \(2.0, 4.0\): the robot cannot stand there in any heading") as caught:
+    with pytest.raises(
+        InputError, match=r"start = \(2.0, 4.0\): the robot cannot stand there in any heading"
+    ) as caught:
         planner(walled()).plan((2.0, 4.0), GOAL)
     assert "the nearest place where it can is (" in str(caught.value)
 

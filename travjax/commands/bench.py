@@ -1,4 +1,4 @@
-"""`travjax bench`: how fast terrain, labelling, the network and site maps are on this machine."""
+"""`travjax bench`: how fast terrain, labelling, the network, site maps and plans are on this machine."""
 
 import argparse
 
@@ -12,7 +12,7 @@ def add(commands: options.Commands) -> None:
     parser = commands.add_parser(
         "bench",
         help="measure speed",
-        description="Measures terrain and labelling on this machine; or the network, or the map of a site.",
+        description="Measures terrain and labelling on this machine; or the network, the map of a site, or plans.",
     )
     options.add_robot(parser)
     options.add_grid(parser)
@@ -26,16 +26,22 @@ def add(commands: options.Commands) -> None:
         "--network", action="store_true", help="measure the network instead: inputs, a training step, a whole map"
     )
     parser.add_argument("--site", type=user_path, metavar="SITE", help="measure the map of a site instead")
+    parser.add_argument("--plan", action="store_true", help="measure plans on synthetic sites of 60 and 250 m instead")
     options.add_out(parser, "runs/bench")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> None:
-    """Measures terrain and labelling, the network, or the map of a site."""
+    """Measures terrain and labelling, the network, the map of a site, or plans."""
     if arguments.site:
         from travjax.site import site_benchmark
 
         site_benchmark.measure(arguments.site, arguments.robot, arguments.out)
+        return
+    if arguments.plan:
+        from travjax.planning import plan_benchmark
+
+        plan_benchmark.measure(arguments.robot, arguments.out)
         return
     setup = options.setup(arguments)
     require(arguments.repeats > 0, "--repeats", arguments.repeats, "at least 1")

@@ -78,11 +78,15 @@ class Planner:
     @usual_flags()
     def plan(self, start: Any, goal: Any, via: Sequence[Any] = (), coordinates: str = "site") -> Plan:
         """Plans a path; see `plan`."""
-        names = ["start", *(f"via {number}" for number in range(1, len(via) + 1)), "goal"]
-        given = zip(names, (start, *via, goal), strict=True)
-        points = [endpoint(name, point, self.costs, coordinates) for name, point in given]
+        points = self.points(start, goal, via, coordinates)
         self.require_standing(points[0])
         return self.checked(points, lambda: self.cheapest(points))
+
+    def points(self, start: Any, goal: Any, via: Sequence[Any] = (), coordinates: str = "site") -> list[Endpoint]:
+        """Returns the places of the lattice where a path begins, passes and ends; see `plan`."""
+        names = ["start", *(f"via {number}" for number in range(1, len(via) + 1)), "goal"]
+        given = zip(names, (start, *via, goal), strict=True)
+        return [endpoint(name, point, self.costs, coordinates) for name, point in given]
 
     def require_standing(self, start: Endpoint) -> None:
         """Raises InputError that says why the robot cannot stand at the start of a path, and where it could."""
