@@ -270,7 +270,8 @@ def _require_all_reached(lattice: MotionLattice) -> None:
             if (there := int(end[one])) not in walked:
                 walked[there] = walked[here] + way[one]
                 queue.append(there)
-    row, col = np.array([walked[h] + w - walked[e] for h, e, w in zip(heading, end, way, strict=True) if h in walked]).T
+    steps = zip(heading.tolist(), end.tolist(), way, strict=True)
+    row, col = np.array([walked[h] + w - walked[e] for h, e, w in steps if h in walked]).T
     area = int(np.gcd.reduce(np.outer(row, col) - np.outer(col, row), axis=None))
     share = len(walked) / lattice.headings / area if area else 0
     allowed = f"such that every heading and place can be reached; with {lattice.headings} headings {share:.0%} can"
