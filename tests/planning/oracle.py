@@ -6,15 +6,18 @@ priced as the docstring of `Motions` says. Only the motions themselves and their
 
 import heapq
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 
 from travjax.planning.motions import Motion, MotionLattice
+from travjax.planning.path import Leg, Path
 from travjax.planning.planner import Plan, Planner
 from travjax.simulation.robot import Robot
+from travjax.site.ground import Site
+from travjax.site.kernel import SiteSetup
 from travjax.site.primitives import PointTurn
 from travjax.traversal import reference, tyre_reference
 
@@ -184,86 +187,83 @@ def turned_by(motion: Motion) -> float:
     return sum(length / abs(radius) for radius, length in motion.primitive.arcs)
 
 
-def check_path(plan: Plan, planner: Planner) -> dict[str, float]:
-    """Checks that a path is drivable, ends where it should, and is what the sequential simulators say.
+def check_plan(plan: Plan, planner: Planner) -> dict[str, float]:
+    """Checks where a plan begins, passes and ends, that no pose exceeds a limit, and what `check_path` does.
 
-    Returns the largest errors: of joins (metres, radians), of drives against the arcs between their poses, and of what
-    was simulated; and the largest share of a limit.
+    Returns the largest errors, as of `check_path`.
     """
-    setup, ground, path = planner.setup, planner.costs.ground, plan.path
-    rows, cols = ground.shape
-    whole = Simulated(ground.part(slice(0, rows), slice(0, cols)), setup.robot, setup.spacing, setup.contact)
-    poses = path.pose - [*ground.origin, 0.0]
-    errors = {"join": 0.0, "join angle": 0.0, "kink": 0.0, "simulated": 0.0, "share": 0.0}
+    poses = plan.path.pose - [*planner.costs.ground.origin, 0.0]
+    origin = planner.costs.ground.origin
+    for row, point in ((0, plan.points[0]), (-1, plan.points[-1])):
+        heading = point.heading
+        assert heading is None or angle(poses[row, 2] - planner.lattice.angles[heading]) < 1e-9
+    places = np.array([(point.x - origin[0], point.y - origin[1]) for point in plan.points])
+    away = np.hypot(*(poses[:, None, :2] - places).transpose(2, 0, 1))
+    assert away[0, 0] < 1e-9 and away[-1, -1] < 1e-9 and away.min(axis=0).max() < 1e-9
+    assert not plan.path.exceeds.any()
+    assert plan.path.known.all() or planner.costs.unknown_cost is not None
+    return check_path(plan.path, plan.legs, planner.costs.ground, planner.setup, planner.lattice.headings)
 
-    parts = [leg.poses(setup.interval, setup.stride) for leg in plan.legs]
+
+def check_path(path: Path, legs: Sequence[Leg], ground: Site, setup: SiteSetup, headings: int) -> dict[str, float]:
+    """Checks that a path is drivable, has enough poses, and is what the sequential simulators say of the whole site.
+
+    Returns the largest errors: of joins (metres, radians), of drives against arcs between their poses (metres), and of
+    what was simulated (metres, radians); and the largest margin as a share of its limit.
+    """
+    errors = {"join": 0.0, "join angle": 0.0, "arc": 0.0, "simulated": 0.0, "share": 0.0}
+    poses = path.pose - [*ground.origin, 0.0]
+    parts = [leg.poses(setup.interval, setup.stride) for leg in legs]
     for before, after in pairwise(parts):
         errors["join"] = max(errors["join"], float(np.hypot(*(before[-1] - after[0])[:2])))
         errors["join angle"] = max(errors["join angle"], angle(before[-1, 2] - after[0, 2]))
-    rows_of_legs = [len(part) - 1 for part in parts]
-    assert len(poses) == 1 + sum(rows_of_legs) == len(path.motion)
-    at = 1
-    for leg, part in zip(plan.legs, parts, strict=True):
-        np.testing.assert_allclose(poses[at : at + len(part) - 1, :2], part[1:, :2], atol=1e-9, rtol=1e-12)
-        assert max(map(angle, poses[at : at + len(part) - 1, 2] - part[1:, 2])) < 1e-9
-        assert set(path.motion[at : at + len(part) - 1]) == {leg.name}
-        at += len(part) - 1
+    if parts:
+        of_legs = np.concatenate([parts[0][:1], *(part[1:] for part in parts)])
+        np.testing.assert_allclose(poses[:, :2], of_legs[:, :2], atol=1e-9, rtol=1e-12)
+        assert max(map(angle, poses[:, 2] - of_legs[:, 2])) < 1e-9
+        names = [leg.name for leg, part in zip(legs, parts, strict=True) for _ in part[1:]]
+        assert path.motion == (names[0], *names)
 
-    place = [(point.x - ground.origin[0], point.y - ground.origin[1]) for point in plan.points]
-    for row, point in ((0, 0), (-1, -1)):
-        np.testing.assert_allclose(poses[row, :2], place[point], atol=1e-9, rtol=1e-12)
-        heading = plan.points[point].heading
-        assert heading is None or angle(poses[row, 2] - planner.lattice.angles[heading]) < 1e-9
-    for x, y in place:
-        assert np.hypot(*(poses[:, :2] - [x, y]).T).min() < 1e-9
-
-    most_turn = 2 * math.pi / planner.lattice.headings / 4 + 1e-9
-    far = 0.0
     turning = np.array([name.startswith("turn") for name in path.motion])
-    for row in range(1, len(poses)):
-        (x, y, was), (to_x, to_y, now) = poses[row - 1], poses[row]
-        turned = math.remainder(now - was, 2 * math.pi)
-        chord, ahead = np.array([to_x - x, to_y - y]), was + turned / 2
-        along = np.array([-math.sin(ahead), math.cos(ahead)]) * (-1 if path.motion[row].startswith("reverse") else 1)
-        if turning[row]:
-            assert abs(turned) <= most_turn and np.hypot(*chord) < 1e-9
-        else:
-            length = float(np.hypot(*chord)) / np.sinc(turned / 2 / math.pi)
-            assert length <= setup.interval + 1e-9
-            errors["kink"] = max(errors["kink"], float(np.hypot(*(chord - along * np.hypot(*chord)))))
-            far += length
-        assert abs(path.distance[row] - far) < 1e-6
+    far = [0.0]
+    for (x, y, was), (to_x, to_y, now), motion in zip(poses, poses[1:], path.motion[1:], strict=False):
+        turned, chord = math.remainder(now - was, 2 * math.pi), math.hypot(to_x - x, to_y - y)
+        if motion.startswith("turn"):
+            assert 0 < abs(turned) <= 2 * math.pi / headings / 4 + 1e-9 and chord < 1e-9
+            assert (turned > 0) == (motion == "turn_left")
+            far.append(far[-1])
+            continue
+        ahead = was + turned / 2  # the chord of an arc points half way between the headings at its ends
+        along = chord * (-1 if motion.startswith("reverse") else 1)
+        miss = to_x - x + math.sin(ahead) * along, to_y - y - math.cos(ahead) * along
+        errors["arc"] = max(errors["arc"], math.hypot(*miss))
+        far.append(far[-1] + chord / float(np.sinc(turned / 2 / math.pi)))
+        assert far[-1] - far[-2] <= setup.interval + 1e-9
+    np.testing.assert_allclose(path.distance, far, atol=1e-9)
 
+    rows, cols = ground.shape
+    whole = Simulated(ground.part(slice(0, rows), slice(0, cols)), setup.robot, setup.spacing, setup.contact)
     limits = dict(zip(setup.robot.event_names, setup.robot.limits, strict=True))
     for row, margins in enumerate(whole.margins(poses)):
+        seen = [path.step[row], path.obstacle[row], path.tilt[row], path.z[row]]
         assert path.known[row] == (margins is not None)
-        assert not path.exceeds[row]
         if margins is None:
-            assert planner.costs.unknown_cost is not None
-            assert np.isnan([path.step[row], path.obstacle[row], path.tilt[row], path.z[row]]).all()
+            assert np.isnan(seen).all() and not path.exceeds[row]
             continue
         if turning[row] or row == 0:
             margins["step"] = 0.0
-        after_unknown = setup.contact == "nearest" and not turning[row] and row > 0 and not path.known[row - 1]
-        if after_unknown:
+        elif setup.contact == "nearest" and not path.known[row - 1]:  # a change from what is unknown
             assert np.isnan(path.step[row])
-            margins["step"] = 0.0
-        state = whole.state(*poses[row])
-        wanted = [margins["obstacle"], margins["tilt"], z_of(state) + ground.height_offset]
-        found = [path.obstacle[row], path.tilt[row], path.z[row]]
-        if not after_unknown:
-            wanted.append(margins["step"])
-            found.append(path.step[row])
-        errors["simulated"] = max(errors["simulated"], float(np.abs(np.subtract(found, wanted)).max()))
-        errors["share"] = max(errors["share"], *(margins[name] / limit for name, limit in limits.items()))
-    assert errors["join"] < 1e-3 and errors["join angle"] < math.radians(0.1)
-    assert errors["kink"] < 1e-9 and errors["simulated"] < 1e-9 and errors["share"] <= 1 + 1e-6, errors
+            margins["step"] = seen[0] = 0.0
+        wanted = [margins["step"], margins["obstacle"], margins["tilt"]]
+        wanted.append(whole.state(*poses[row]).centre + ground.height_offset)
+        errors["simulated"] = max(errors["simulated"], float(np.abs(np.subtract(seen, wanted)).max()))
+        share = max(margins[name] / limit for name, limit in limits.items())
+        errors["share"] = max(errors["share"], share)
+        assert path.exceeds[row] == (share > 1 + 1e-6)
+    assert errors["join"] < 1e-9 and errors["join angle"] < 1e-9, errors  # a millimetre and a tenth of a degree may be
+    assert errors["arc"] < 1e-9 and errors["simulated"] < 1e-9, errors
     return errors
-
-
-def z_of(state) -> float:
-    """Returns the height of the pose plane's centre."""
-    return float(state.centre)
 
 
 def angle(radians: float) -> float:
