@@ -89,7 +89,8 @@ class MotionCosts:
             factor, in_the_way = (
                 tile.cropped(field, self.shape).reshape(len(factor), -1).T for field in (factor, in_the_way)
             )
-            self.cost[places, motions] = factor * self.lattice.costs[motions]
+            possible = np.isfinite(factor)  # a turn may cost nothing, and 0 * inf is no number
+            self.cost[places, motions] = np.multiply(factor, self.lattice.costs[motions], out=factor, where=possible)
             self.in_the_way[places, motions] = in_the_way
             first = motions.stop
         return at

@@ -13,8 +13,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from travjax.config import load_toml, require, require_length, require_number
 from travjax.planning.biarcs import Arc, biarc
@@ -137,6 +135,9 @@ class MotionLattice:
         whole = isinstance(self.headings, Integral) and not isinstance(self.headings, bool)
         require(whole and 1 <= self.headings <= 360, "headings", self.headings, "a whole number from 1 to 360")
         require_length("stride", self.stride, 0.001, 1000)
+        for turn in self.motions.turns:
+            allowed = f"at most {self.headings // 4} of {self.headings} headings, 90 degrees"
+            require(4 * abs(turn) <= self.headings, "turns", turn, allowed)
         _require_all_reached(self)
 
     @property
@@ -237,14 +238,15 @@ def _drive(lattice: MotionLattice, heading: int, turn: int) -> Motion:
             continue
         length, turned = sum(arc.length for arc in arcs), sum(abs(arc.turn) for arc in arcs)
         turning = abs(arcs[0].turn + arcs[1].turn - angle) < 1e-6  # and not the other way round
-        fits = turning and turned <= MOST_TURN and min(abs(arc.radius) for arc in arcs) >= radius - 1e-9
+        fits = turning and turned <= MOST_TURN + 1e-9 and min(abs(arc.radius) for arc in arcs) >= radius - 1e-9
         if fits and (best is None or (round(length, 9), round(turned, 9)) < best[:2]):
             best = round(length, 9), round(turned, 9), rows, cols, arcs
     reach = FARTHEST * lattice.stride
     allowed = f"a radius that a drive from {math.degrees(start):g} degrees by {turn} of {count} headings can keep"
     require(best is not None, "radius", radius, f"{allowed} within {reach:g} m")
     assert best is not None
-    length, turned, rows, cols, arcs = best
+    _, turned, rows, cols, arcs = best
+    length = sum(arc.length for arc in arcs)  # not rounded: the drive ends on the place
     name = "straight" if turn == 0 else "left" if turn > 0 else "right"
     pieces = ((math.inf, length),) if turned < 1e-6 else tuple((arc.radius, arc.length) for arc in arcs)
     end = (heading + turn) % count
@@ -253,24 +255,24 @@ def _drive(lattice: MotionLattice, heading: int, turn: int) -> Motion:
 
 @lru_cache(maxsize=16)
 def _require_all_reached(lattice: MotionLattice) -> None:
-    """Raises InputError unless every state of an open plane can be reached from every other."""
-    reach = max(max(abs(drive.rows), abs(drive.cols)) for drive in lattice.drives)
-    circle = 0 if lattice.motions.point_turns else math.ceil(2.5 * lattice.motions.radius / lattice.stride)
-    half = min(2 * reach + circle + 2, 60)
-    count, moves = 2 * half + 1, lattice.moves
-    places = np.arange(count**2).reshape(count, count)
-    begins, ends = [], []
-    for heading, step in zip(*np.nonzero(moves.motion >= 0), strict=True):
-        rows, cols = moves.rows[heading, step], moves.cols[heading, step]
-        start = places[max(-rows, 0) : count - max(rows, 0), max(-cols, 0) : count - max(cols, 0)].ravel()
-        begins.append(start * lattice.headings + heading)
-        ends.append((start + rows * count + cols) * lattice.headings + moves.end[heading, step])
-    begin, end = np.concatenate(begins), np.concatenate(ends)
-    states = count**2 * lattice.headings
-    graph = csr_array((np.ones(len(begin), bool), (begin, end)), shape=(states, states))
-    part = connected_components(graph, connection="strong")[1].reshape(count, count, -1)
-    middle = part[half - 1 : half + 2, half - 1 : half + 2]
-    reached = float((middle == middle[1, 1, 0]).mean())
-    what = f"{lattice.motions.turns}, {lattice.headings} headings"
-    allowed = f"such that every heading and place can be reached; {reached:.0%} of the states around a place can"
-    require(reached == 1, "turns", what, f"{allowed}")
+    """Raises InputError unless every state of an open plane can be reached from every other.
+
+    Motions are the same from every place and turn by the same numbers of headings from every heading. So it is enough
+    to know which headings a walk from heading 0 reaches, and where walks lead that end in their first heading: to all
+    places if the cells that these ways span have, taken together, an area of one place.
+    """
+    moves = lattice.moves
+    heading, step = np.nonzero(moves.motion >= 0)
+    end, way = moves.end[heading, step], np.stack([moves.rows, moves.cols], axis=-1)[heading, step]
+    walked, queue = {0: np.zeros(2, int)}, [0]
+    for here in queue:
+        for one in np.flatnonzero(heading == here):
+            if (there := int(end[one])) not in walked:
+                walked[there] = walked[here] + way[one]
+                queue.append(there)
+    steps = zip(heading.tolist(), end.tolist(), way, strict=True)
+    row, col = np.array([walked[h] + w - walked[e] for h, e, w in steps if h in walked]).T
+    area = int(np.gcd.reduce(np.outer(row, col) - np.outer(col, row), axis=None))
+    share = len(walked) / lattice.headings / area if area else 0
+    allowed = f"such that every heading and place can be reached; with {lattice.headings} headings {share:.0%} can"
+    require(share == 1, "turns", lattice.motions.turns, allowed)

@@ -80,7 +80,7 @@ class Path:
 def drive(legs: list[Leg], start: Float[np.ndarray, " 3"], ground: Site, setup: SiteSetup) -> tuple[Path, list[int]]:
     """Simulates the poses of legs by the sequential simulators.
 
-    start: pose where the path begins, for a path without legs; from the site's south-west node
+    start: pose where the path begins, and the first leg if there is one, from the site's south-west node
     Returns the path, and the number of the leg that each pose belongs to.
     """
     parts, owner = [np.asarray(start, float)[None]], [0]
