@@ -10,7 +10,7 @@ import travjax
 
 LAYERS = {
     "": "config signals locks memory files npz_stream progress jax_flags batching devices",
-    "simulation": "arrays grid heights events contact robot actions footprint tyre_tables setup",
+    "simulation": "arrays grid heights events contact physics_table robot actions footprint tyre_tables setup",
     "traversal": "arcs nearest steps tyre tyre_trajectories traverse reference tyre_reference pose_by_pose",
     "terrain": "noise landforms rock_field styles",
     "rasters": "coordinates reading_options formats raster gdal_files grid_maps array_files holes surface",
@@ -26,7 +26,7 @@ LAYERS = {
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
-    "physics": "config model drive labelling agreement check report",
+    "physics": "model drive labelling agreement check report",
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
     "timing comparison physics",

@@ -15,7 +15,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -97,18 +97,21 @@ def naming(what: object) -> Iterator[None]:
         raise
 
 
-def load_toml(path: str | Path, kind: type[Config], others: Sequence[str] = ()) -> Config:
-    """Reads one configuration dataclass from a TOML file; others: names of tables in it that are not its own.
+def load_toml(path: str | Path, kind: type[Config], others: Mapping[str, type] | None = None) -> Config:
+    """Reads one configuration dataclass from a TOML file.
 
+    others: configurations of tables in it that are not its own, by name; only their keys are checked
     Raises InputError that names the file when it is missing or not TOML, when a key is unknown or a field without a
     default is absent, and when the dataclass refuses a value.
     """
     path = Path(os.path.expanduser(path))
     table = _parsed(path, read_text(path), tomllib.loads, "a TOML file", finite=False)
-    own = {key: value for key, value in table.items() if not (key in others and isinstance(value, dict))}
     older: Renamed = {}
     try:
-        made = _made(own, kind, older)
+        for name, other in (others or {}).items():
+            if isinstance(table.get(name), dict):
+                _require_keys(name, table.pop(name), other, kind)
+        made = _made(table, kind, older)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     say_renamed(path, older)
@@ -295,7 +298,7 @@ def _fields_from(table: dict, kind: type, older: Renamed) -> dict:
             older[key] = f"{name}_deg" if degrees else name
             require(older[key] not in table, key, value, f"left out beside {older[key]}, its name now")
         if name not in names or degrees and not names[name].metadata.get("angle"):
-            raise InputError(_unknown(key, names))
+            raise InputError(_unknown(key, kind))
         if name in values:
             raise InputError(f"{key} = {shown(value)}: is given twice, once in degrees; allowed: once")
         if degrees:
@@ -315,14 +318,25 @@ def _fields_from(table: dict, kind: type, older: Renamed) -> dict:
     return values
 
 
-def _unknown(key: str, names: dict[str, dataclasses.Field]) -> str:
-    """Says what is wrong with a key that is no field: the field it may be meant for, and all fields as they are
-    written.
-    """
-    written = [(name, f"{name}_deg") if field.metadata.get("angle") else (name,) for name, field in names.items()]
-    allowed = [form for forms in written for form in forms]
-    near = difflib.get_close_matches(key, allowed, n=1)
-    meant = f"; perhaps {near[0]} is meant" if near else ""
+def _require_keys(name: str, keys: Iterable[str], kind: type, around: type) -> None:
+    """Raises InputError for a key of the table `name` that `kind` lacks; around: of the keys above the table."""
+    for key in keys:
+        if key not in _written(kind):
+            above = f"; {key} belongs above [{name}]" if key in _written(around) else ""
+            raise InputError(f"[{name}] {_unknown(key, kind, above)}")
+
+
+def _written(kind: type) -> list[str]:
+    """Returns the keys of a configuration as they are written: those of angles also in degrees."""
+    ends = lambda field: ("", "_deg") if field.metadata.get("angle") else ("",)
+    return [field.name + end for field in dataclasses.fields(kind) for end in ends(field)]
+
+
+def _unknown(key: str, kind: type, meant: str = "") -> str:
+    """Says what is wrong with a key that is no field: all that are allowed, and, unless given, which may be meant."""
+    allowed = _written(kind)
+    if not meant and (near := difflib.get_close_matches(key, allowed, n=1)):
+        meant = f"; perhaps {near[0]} is meant"
     return f"unknown key {shown(key)}; allowed: {', '.join(allowed)}{meant}"
 
 

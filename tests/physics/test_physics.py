@@ -10,7 +10,6 @@ from tests.commandline import run_words
 from travjax.config import InputError
 from travjax.experiments import physics as experiment
 from travjax.physics.check import check, passed, yaw_ratio
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import VERSION
 from travjax.physics.labelling import OUTCOMES, Variation, label_ground, label_physics
 from travjax.simulation.actions import ActionSpace
@@ -20,7 +19,7 @@ from travjax.simulation.setup import Setup
 
 pytest.importorskip("mujoco", reason="the extra physics is not installed")
 
-ROBOT, PHYSICS = Robot.load("seekur_jr"), PhysicsConfig.load("seekur_jr")
+ROBOT, PHYSICS = Robot.load("seekur_jr"), Robot.load_physics("seekur_jr")
 ACTIONS = ActionSpace(turns=4, arc_lengths=(0.6, 0.8))
 X, Y = np.meshgrid(Grid().axis(), Grid().axis())
 
@@ -94,7 +93,7 @@ def test_bad_numbers_are_named(change, message):
 
 def test_a_robot_without_the_table_is_refused_by_name():
     with pytest.raises(InputError, match=r"husky_a200.toml: no table \[physics\]; needed: one with at least mass"):
-        PhysicsConfig.load("husky_a200")
+        Robot.load_physics("husky_a200")
     code, _, err = run_words("physics", "--robot", "husky_a200", "--check")
     assert code == 2 and "no table [physics]" in err
 
@@ -102,10 +101,10 @@ def test_a_robot_without_the_table_is_refused_by_name():
 def test_labels_do_not_depend_on_the_table(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text(Robot.path_of("seekur_jr").read_text().replace("mass = 77.0", "mass = 50.0"))
-    assert Robot.load(path) == ROBOT and PhysicsConfig.load(path).mass == 50.0
+    assert Robot.load(path) == ROBOT and Robot.load_physics(path).mass == 50.0
     path.write_text(path.read_text() + "wheels = 4\n")
     with pytest.raises(InputError, match=r"mine.toml: \[physics\] unknown key 'wheels'"):
-        PhysicsConfig.load(path)
+        Robot.load_physics(path)
 
 
 def test_the_command_writes_outcomes_table_and_picture(tmp_path):

@@ -163,6 +163,34 @@ def test_a_misspelt_limit_is_told_the_one_that_is_meant(tmp_path):
         Robot.load(path)
 
 
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("max_roll_deg", "; max_roll_deg belongs above [physics]"),
+        ("ride_height", "; ride_height belongs above [physics]"),
+        ("centre_heigt", "; perhaps centre_height is meant"),
+        ("wheels", ""),
+    ],
+)
+def test_a_key_below_physics_that_is_none_of_its_own_is_refused(tmp_path, key, message):
+    path = tmp_path / "mine.toml"
+    path.write_text(Robot.path_of("seekur_jr").read_text() + f"\n{key} = 0.1\n")
+    allowed = "mass, centre_height, drive_torque, drive_inertia, payload, coupled, friction, speed, stiffness_time, "
+    line = f"{path}: [physics] unknown key '{key}'; allowed: {allowed}stiffness_damping, impedance{message}"
+    for load in (Robot.load, Robot.load_physics):
+        with pytest.raises(InputError) as raised:
+            load(path)
+        assert str(raised.value) == line
+
+
+def test_a_table_of_physics_that_is_not_complete_is_no_matter_of_labels(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text(Robot.path_of("seekur_jr").read_text().replace("mass = 77.0", ""))
+    assert Robot.load(path) == SEEKUR_JR
+    with pytest.raises(InputError, match=r"mine.toml: \[physics\] missing mass$"):
+        Robot.load_physics(path)
+
+
 def test_limits_are_step_obstacle_tilt():
     robot = replace(SEEKUR_JR, max_step=0.1, ride_height=0.2, max_tilt=0.3)
     assert robot.limits == (0.1, 0.2, 0.3)

@@ -165,6 +165,18 @@ def test_high_ground_loses_nothing(ground):
             {"spacing": 0.002},
             "spacing = 0.002: must be at least 0.0034 m, at which Seekur Jr with its passes spans 512 nodes",
         ),
+        (
+            {"spacing": 0.003, "stride": 0.252},
+            "spacing = 0.003: must be at least 0.0034 m, at which Seekur Jr with its passes spans 512 nodes$",
+        ),
+        (
+            {"stride": 100.0, "primitives": straight_passes(4, 100.0)},
+            "stride = 100.0: must be at most 30.25 m, at which Seekur Jr with its passes spans 512 nodes of 0.0625 m",
+        ),
+        (
+            {"primitives": (Primitive(0.0, ((math.inf, 20.0),)),)},
+            "primitives, reach = 20.0: must be at most 15.1 m from a place, at which Seekur Jr with its passes spans",
+        ),
         ({"primitives": ()}, r"primitives = \(\): must be at least one"),
     ],
 )

@@ -17,7 +17,7 @@ from travjax.simulation.events import Margins
 from travjax.simulation.robot import Robot
 from travjax.site import kernel, mapping
 from travjax.site.costs import band_names, products
-from travjax.site.ground import SiteGround
+from travjax.site.ground import ArrayGround, SiteGround
 from travjax.site.kernel import simulate_site
 from travjax.site.mapping import map_site, save_map, setup_of
 from travjax.site.primitives import straight_passes
@@ -177,6 +177,15 @@ def test_arrays_in_memory_are_the_same(mapped, site_file):
     np.testing.assert_allclose(found.heights, heights()[::4, ::4], atol=1e-3)
 
 
+def test_arrays_that_know_where_they_lie_are_mapped_there():
+    ground = ArrayGround(np.zeros((30, 40), np.float32), 812.0, 0.1, (5.0, 6.0), "EPSG:32632")
+    found = map_site(ground, "leo_rover", headings=1)
+    assert found.x[:2] == pytest.approx([5.0, 5.3]) and found.y[0] == 6.0 and found.crs == "EPSG:32632"
+    assert (found.heights == 812.0).all() and (found.bands["known_headings"] == 1).any()
+    plain = map_site(np.zeros((30, 40)), "leo_rover", headings=1, spacing=0.1)
+    assert plain.x[:2] == pytest.approx([0.0, 0.3]) and plain.crs is None
+
+
 def test_xarray_gets_names_and_coordinates():
     pytest.importorskip("xarray", reason="xarray is not installed")
     data = map_site(np.zeros((40, 50)), headings=4).to_xarray()
@@ -260,6 +269,7 @@ def test_coarse_cells_are_refused_unless_allowed_and_then_explained(tmp_path):
     ("more", "message"),
     [
         (("--stride", 0.1), "stride = 0.1: must be a whole number of nodes, 0.0625 m each"),
+        (("--stride", 100), "stride = 100.0: must be at most 30.25 m"),
         (("--headings", 0), "headings = 0: must be a whole number from 1 to 360"),
         (("--spacing", 0), "spacing = 0.0: must be"),
         (("--robot", "nobody"), "robot"),

@@ -33,11 +33,11 @@ def run(arguments: argparse.Namespace) -> None:
     """Checks the model, drives, and writes the outcomes; exit code 1 when the model fails its check."""
     from travjax.evaluation.tables import rows_table
     from travjax.physics.check import check, passed
-    from travjax.physics.config import PhysicsConfig
     from travjax.physics.report import drive_maps
+    from travjax.simulation.robot import Robot
 
     require(arguments.trajectories > 0, "--trajectories", arguments.trajectories, "at least 1")
-    physics = PhysicsConfig.load(arguments.robot)
+    physics = Robot.load_physics(arguments.robot)
     setup = options.setup(arguments)
     checks = check(setup.robot, physics)
     rows = [asdict(one) | {"passed": "yes" if one.passed else "NO"} for one in checks]

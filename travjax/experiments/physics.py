@@ -23,7 +23,6 @@ from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch
 from travjax.files import find_data, find_preset, output_folder, save_npz, save_text, user_path
 from travjax.physics.agreement import Driven, agreement, by_event, by_margin, event_factors, repeats
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import OUTCOMES, VERSION
 from travjax.physics.labelling import Variation, label_physics
 from travjax.simulation.contact import CONTACTS
@@ -83,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Samples, drives, compares, and writes report and figures; goes on where it was stopped."""
     path = find_preset(arguments.preset, "physics")
     config = load_toml(path, PhysicsExperiment)
-    robot, physics = Robot.load(config.robot), PhysicsConfig.load(config.robot)
+    robot, physics = Robot.load(config.robot), Robot.load_physics(config.robot)
     folder = output_folder(arguments.out or Path("runs/physics") / path.stem)
     heights, grounds = _maps(config)
     margins = {contact: _in_limits(heights, robot, contact) for contact in CONTACTS}

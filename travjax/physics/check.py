@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import Driver
 from travjax.physics.labelling import label_ground
 from travjax.physics.model import build
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
+from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.robot import Robot
 
 GRID = Grid()

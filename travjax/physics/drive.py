@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.model import TIME_STEP, World, mujoco
 from travjax.simulation.actions import ActionSpace, arc_poses
+from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.robot import Robot
 
 VERSION = 3

@@ -18,11 +18,11 @@ from scipy.ndimage import map_coordinates
 
 from travjax.config import InputError, require, to_json
 from travjax.files import save_text
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import OUTCOMES, VERSION, Driver
 from travjax.physics.model import build, mujoco
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
+from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
 

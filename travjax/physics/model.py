@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from travjax.config import require_installed
-from travjax.physics.config import PhysicsConfig
+from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.robot import Robot
 
 TIME_STEP = 0.004

@@ -10,9 +10,9 @@ from travjax.data.map_batches import MapStream, joined, labelled, title
 from travjax.data.sensor_noise import filled
 from travjax.evaluation.tables import rows_table
 from travjax.files import output_folder, save_npz, save_text
-from travjax.physics.config import PhysicsConfig
 from travjax.physics.drive import OUTCOMES, VERSION
 from travjax.physics.labelling import ARRIVED, label_physics
+from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.setup import Setup
 
 SHOWN = 4

@@ -4,14 +4,15 @@ import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from travjax.config import InputError, load_toml, require, require_length, require_number
+from travjax.config import InputError, load_table, load_toml, require, require_length, require_number
 from travjax.simulation.contact import require_contact
 from travjax.simulation.events import OPTIONAL, PAPER, Event
+from travjax.simulation.physics_table import PhysicsConfig
 
 PRESETS = Path(__file__).parent / "robots"
 
-OTHER_TABLES = ("physics",)
-"""Tables of a robot's file that are read elsewhere: labels do not depend on them."""
+OTHER_TABLES = {"physics": PhysicsConfig}
+"""Tables of a robot's file that are no part of a Robot: labels do not depend on them."""
 
 LONGEST_NAME = 100
 """Characters that a robot's name may have at most."""
@@ -92,6 +93,20 @@ class Robot:
         if isinstance(source, Robot):
             return source
         return load_toml(Robot.path_of(source), Robot, OTHER_TABLES)
+
+    @staticmethod
+    def load_physics(source: str | Path) -> PhysicsConfig:
+        """Reads the `[physics]` table of a preset by name, or of a TOML file by path.
+
+        Raises InputError as `load` does, and when the file has no such table, or when that is wrong.
+        """
+        path = Robot.path_of(source)
+        Robot.load(path)
+        found = load_table(path, "physics", PhysicsConfig)
+        if found is None:
+            needed = "mass, centre_height, drive_torque and drive_inertia"
+            raise InputError(f"{path}: no table [physics]; needed: one with at least {needed} (see docs/physics.md)")
+        return found
 
     @staticmethod
     def path_of(source: str | Path) -> Path:

@@ -71,9 +71,24 @@ class SiteSetup:
         ratio = self.stride / self.spacing
         whole = self.stride > 0 and round(ratio) >= 1 and abs(ratio - round(ratio)) < 1e-6
         require(whole, "stride", self.stride, f"a whole number of nodes, {self.spacing:g} m each")
-        finest = self._reach / (WIDEST // 2 - 2)
-        allowed = f"at least {finest:.2g} m, at which {self.robot.name} with its passes spans {WIDEST} nodes"
-        require(self.spacing >= finest, "spacing", self.spacing, allowed)
+        self._require_span()
+
+    def _require_span(self) -> None:
+        """Raises InputError where the robot at its poses spans more than WIDEST nodes, and names what makes it so."""
+        most = WIDEST // 2 - 2
+        room = most * self.spacing - self._outline
+        if self._farthest <= room:
+            return
+        spans = f"at which {self.robot.name} with its passes spans {WIDEST} nodes"
+        passes = self._farthest <= self.stride / 2 + 1e-9
+        if room < self.spacing / 2 or passes and math.isclose(self.stride, self.usual_stride(self.spacing)):
+            finest = (self._farthest + self._outline) / most
+            require(False, "spacing", self.spacing, f"at least {finest:.2g} m, {spans}")
+        spans = f"{spans} of {self.spacing:g} m"
+        if passes:
+            longest = math.floor(2 * room / self.spacing) * self.spacing
+            require(False, "stride", self.stride, f"at most {longest:g} m, {spans}")
+        require(False, "primitives, reach", round(self._farthest, 3), f"at most {room:.3g} m from a place, {spans}")
 
     @staticmethod
     def usual_stride(spacing: float) -> float:
@@ -88,18 +103,22 @@ class SiteSetup:
     @cached_property
     def grid(self) -> Grid:
         """A grid around a place that holds all poses."""
-        half = math.ceil(self._reach / self.spacing) + 2
+        half = math.ceil((self._farthest + self._outline) / self.spacing) + 2
         return Grid(2 * half * self.spacing, self.spacing)
 
     @cached_property
-    def _reach(self) -> float:
-        """Metres from a place to the farthest point of the robot."""
-        robot, poses = self.robot, all_poses(self.primitives, self.interval)
-        outline = math.hypot(
-            max(robot.overall_width, robot.track + robot.wheel_width, robot.chassis_width),
-            max(robot.overall_length, robot.wheelbase + robot.wheel_diameter, robot.chassis_length),
-        )
-        return float(np.hypot(poses[..., 0], poses[..., 1]).max()) + outline / 2
+    def _farthest(self) -> float:
+        """Metres from a place to the farthest pose."""
+        poses = all_poses(self.primitives, self.interval)
+        return float(np.hypot(poses[..., 0], poses[..., 1]).max())
+
+    @property
+    def _outline(self) -> float:
+        """Metres from the robot's centre to its farthest point."""
+        robot = self.robot
+        width = max(robot.overall_width, robot.track + robot.wheel_width, robot.chassis_width)
+        length = max(robot.overall_length, robot.wheelbase + robot.wheel_diameter, robot.chassis_length)
+        return math.hypot(width, length) / 2
 
     @cached_property
     def halo(self) -> int:

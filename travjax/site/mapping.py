@@ -1,6 +1,5 @@
 """Maps of whole sites: simulated tile by tile, and written for GIS and navigation (SPEC section 13)."""
 
-import math
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Executor
 from dataclasses import dataclass
@@ -18,13 +17,12 @@ from travjax.files import atomic_write, held, output_folder, resolved, save_text
 from travjax.memory import require_memory
 from travjax.rasters.grid_maps import rosbags, write_grid_map
 from travjax.rasters.raster import COARSEST
-from travjax.simulation.heights import as_site
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.site import site_figures
 from travjax.site.costs import KINDS, UNKNOWN_COST, band_names, kinds_of
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
-from travjax.site.ground import ArrayGround, SiteGround
+from travjax.site.ground import Site, SiteGround, open_site
 from travjax.site.kernel import SiteSetup, contact_of, tiles_of
 from travjax.site.nav2 import over_headings, save_nav2
 from travjax.site.primitives import straight_passes
@@ -79,13 +77,13 @@ def setup_of(
     Raises InputError that names argument, value and what is allowed.
     """
     require_number("spacing", spacing, 0, 1000, "metres, above 0 and at most 1000")
-    chosen, places = chosen_robot(robot), math.ceil(0.25 / spacing - 1e-6) * spacing if stride is None else stride
+    chosen, places = chosen_robot(robot), SiteSetup.usual_stride(spacing) if stride is None else stride
     require_length("stride", places, 0.001, 1000)
     return SiteSetup(chosen, straight_passes(headings, places), spacing, places, contact=contact_of(chosen, contact))
 
 
 def map_site(
-    site: str | Path | SiteGround | Float[np.ndarray, "rows cols"],
+    site: str | Path | Site | Float[np.ndarray, "rows cols"],
     robot: Robot | str | None = None,
     *,
     headings: int = 16,
@@ -102,13 +100,8 @@ def map_site(
     contact:  contact model, "tyre" or "nearest"; that of the robot's file unless given, or else "tyre"
     Source: SPEC section 13. Raises InputError as `SiteGround.open` and `simulate_site` do.
     """
-    ground: SiteGround | ArrayGround
-    if isinstance(site, str | Path):
-        ground = SiteGround.open(site, spacing)
-    else:
-        ground = site if isinstance(site, SiteGround) else ArrayGround(*as_site(site))
-    nodes = ground.spacing if isinstance(ground, SiteGround) else 0.0625 if spacing is None else spacing
-    setup = setup_of(robot, headings, stride, nodes, contact)
+    ground = open_site(site, spacing)
+    setup = setup_of(robot, headings, stride, ground.spacing, contact)
     names, lattice = band_names(setup.robot), setup.lattice(ground.shape)
     bands = np.full((len(names), *lattice), np.nan, np.float32)
     costs = np.full((headings, *lattice), UNKNOWN_COST, np.uint8)
@@ -118,11 +111,9 @@ def map_site(
             place = ..., *part.tile.within(lattice)
             bands[place], costs[place] = part.bands, part.costs
             heights[place] = part.heights.astype(float) + ground.height_offset
-    origin = ground.origin if isinstance(ground, SiteGround) else (0.0, 0.0)
-    x, y = (start + setup.stride * np.arange(count) for start, count in zip(origin, lattice[::-1], strict=True))
+    x, y = (start + setup.stride * np.arange(count) for start, count in zip(ground.origin, lattice[::-1], strict=True))
     angles = 2 * np.pi * np.arange(headings) / headings
-    crs = ground.crs if isinstance(ground, SiteGround) else None
-    return SiteMap(dict(zip(names, bands, strict=True)), costs, heights, angles, x, y, crs)
+    return SiteMap(dict(zip(names, bands, strict=True)), costs, heights, angles, x, y, ground.crs)
 
 
 def save_map(

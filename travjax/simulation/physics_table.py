@@ -1,10 +1,8 @@
 """What a physics engine needs to know of a robot beside its dimensions: the `[physics]` table of its file."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-from travjax.config import InputError, load_table, require, require_number
-from travjax.simulation.robot import Robot
+from travjax.config import require, require_number
 
 
 @dataclass(frozen=True)
@@ -54,16 +52,3 @@ class PhysicsConfig:
         require(isinstance(self.coupled, bool), "coupled", self.coupled, "true or false")
         numbers = isinstance(self.impedance, tuple) and len(self.impedance) == 5
         require(numbers, "impedance", self.impedance, "five numbers, as MuJoCo's solimp")
-
-    @staticmethod
-    def load(robot: str | Path) -> "PhysicsConfig":
-        """Reads the `[physics]` table of a robot, given by its name or TOML file.
-
-        Raises InputError when there is no such robot, when its file has no such table, or when it is wrong.
-        """
-        path = Robot.path_of(robot)
-        found = load_table(path, "physics", PhysicsConfig)
-        if found is None:
-            needed = "mass, centre_height, drive_torque and drive_inertia"
-            raise InputError(f"{path}: no table [physics]; needed: one with at least {needed} (see docs/physics.md)")
-        return found
