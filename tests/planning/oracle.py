@@ -78,7 +78,7 @@ class Exhaustive:
         self.lattice: MotionLattice = planner.lattice
         self.robot, self.interval, self.stride = setup.robot, setup.interval, setup.stride
         self.shape = setup.lattice(ground.shape)
-        self.unknown_cost = planner.costs.unknown_cost
+        self.unknown_cost = planner.unknown_cost
         rows, cols = ground.shape
         heights = ground.part(slice(0, rows), slice(0, cols))
         self.simulated = Simulated(heights, setup.robot, setup.spacing, setup.contact)
@@ -201,7 +201,7 @@ def check_plan(plan: Plan, planner: Planner) -> dict[str, float]:
     away = np.hypot(*(poses[:, None, :2] - places).transpose(2, 0, 1))
     assert away[0, 0] < 1e-9 and away[-1, -1] < 1e-9 and away.min(axis=0).max() < 1e-9
     assert not plan.path.exceeds.any()
-    assert plan.path.known.all() or planner.costs.unknown_cost is not None
+    assert plan.path.known.all() or planner.unknown_cost is not None
     return check_path(plan.path, plan.legs, planner.costs.ground, planner.setup, planner.lattice.headings)
 
 

@@ -8,8 +8,8 @@ import pytest
 import travjax
 from tests.planning.sites import NODES, SETTINGS, SPACING, parted, plane, walled
 from travjax.config import InputError
-from travjax.planning.costs import UNKNOWN
 from travjax.planning.endpoints import endpoint
+from travjax.planning.judges import UNKNOWN
 from travjax.planning.motions import Motions
 from travjax.planning.no_path import NoPathError
 from travjax.planning.planner import Planner, plan

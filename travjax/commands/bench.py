@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
         site_benchmark.measure(arguments.site, arguments.robot, arguments.out)
         return
     if arguments.plan:
-        from travjax.planning import plan_benchmark
+        from travjax.plan_results import plan_benchmark
 
         plan_benchmark.measure(arguments.robot, arguments.out)
         return

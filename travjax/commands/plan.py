@@ -74,9 +74,9 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Plans the path and writes the results; returns the exit code."""
+    from travjax.plan_results.plan_report import save_no_path, save_plan, save_to_go
     from travjax.planning.motions import Motions
     from travjax.planning.no_path import NoPathError
-    from travjax.planning.plan_report import save_no_path, save_plan, save_to_go
     from travjax.planning.planner import Planner
     from travjax.planning.to_go import CostToGo
     from travjax.simulation.contact import spacing_note

@@ -10,7 +10,8 @@ from pyproj import Transformer
 from pyproj.exceptions import ProjError
 
 from travjax.config import InputError, require, require_number, shown
-from travjax.planning.costs import UNKNOWN, MotionCosts
+from travjax.planning.costs import MotionCosts
+from travjax.planning.judges import UNKNOWN
 from travjax.rasters.coordinates import is_local, parsed
 from travjax.site.ground import Site
 

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 from scipy.ndimage import binary_dilation
 
-from travjax.planning.costs import UNKNOWN, MotionCosts
+from travjax.planning.costs import MotionCosts
 from travjax.planning.endpoints import Endpoint, in_the_way_named, place_text
+from travjax.planning.judges import UNKNOWN
 from travjax.planning.search import Search, bounds
 
 

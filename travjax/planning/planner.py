@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -12,6 +13,7 @@ from travjax.config import InputError, require_number, shown
 from travjax.jax_flags import usual_flags
 from travjax.planning.costs import MotionCosts
 from travjax.planning.endpoints import Endpoint, endpoint, standing, why_not_standing
+from travjax.planning.judges import Judge, MarginJudge
 from travjax.planning.motions import MotionLattice, Motions
 from travjax.planning.no_path import NoPathError, no_path
 from travjax.planning.path import Leg, Path, drive
@@ -59,8 +61,9 @@ class Planner:
         contact: str | None = None,
         interval: float = 0.06,
         unknown_cost: float | None = None,
+        judge: Callable[[Site, SiteSetup, MotionLattice], Judge] | None = None,
     ):
-        """See `plan`."""
+        """See `plan`; judge: makes what says how good motions are, by exact margins unless given."""
         chosen, spacing = chosen_robot(robot), ground.spacing
         places = SiteSetup.usual_stride(spacing) if stride is None else stride
         if unknown_cost is not None:
@@ -68,7 +71,10 @@ class Planner:
         lattice = MotionLattice(motions or Motions(), headings, places)
         standing_still = (PointTurn(0.0),)
         self.setup = SiteSetup(chosen, standing_still, spacing, places, interval, contact_of(chosen, contact))
-        self.costs = MotionCosts(ground, self.setup, lattice, unknown_cost)
+        self.unknown_cost = unknown_cost
+        if judge is None:
+            judge = partial(MarginJudge, unknown_cost=unknown_cost)
+        self.costs = MotionCosts(ground, self.setup, lattice, judge(ground, self.setup, lattice))
 
     @property
     def lattice(self) -> MotionLattice:
@@ -100,8 +106,9 @@ class Planner:
             legs, cost, first = find()
             at = np.array([start.col * stride, start.row * stride, self.lattice.angles[first % self.lattice.headings]])
             path, owner = drive(legs, at, self.costs.ground, self.setup)
-            bad = path.exceeds | (~path.known & (self.costs.unknown_cost is None))
-            if not bad.any() or not legs:
+            judge = self.costs.judge
+            bad = path.exceeds if judge.unknown_allowed else path.exceeds | ~path.known
+            if not (judge.final and legs and bad.any()):
                 break
             for number in {owner[row] for row in np.flatnonzero(bad)}:
                 self.costs.block(legs[number])

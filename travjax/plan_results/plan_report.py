@@ -9,8 +9,8 @@ from travjax.config import one_line
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import held, output_folder, save_text
+from travjax.plan_results.plan_figures import no_path_figure, plan_figure, to_go_figure
 from travjax.planning.no_path import NoPathError
-from travjax.planning.plan_figures import no_path_figure, plan_figure, to_go_figure
 from travjax.planning.planner import Plan, Planner
 from travjax.planning.to_go import CostToGo
 from travjax.simulation.events import EVENTS

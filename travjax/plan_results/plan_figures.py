@@ -9,8 +9,8 @@ from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
 
 from travjax.evaluation.map_figures import UNKNOWN_COLOUR
-from travjax.planning.costs import UNKNOWN
 from travjax.planning.endpoints import Endpoint
+from travjax.planning.judges import UNKNOWN
 from travjax.planning.no_path import NoPathError
 from travjax.planning.path import Path
 from travjax.planning.planner import Plan, Planner
