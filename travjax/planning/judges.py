@@ -84,6 +84,5 @@ class MarginJudge:
             in_the_way[over & (ours >= np.maximum(share, 1))] = number
             share = np.fmax(share, ours)
         factor = np.where(in_the_way > 0, np.inf, 1 + self._risk * np.minimum(share, 1) ** 2)
-        return np.where(known, factor, self._unknown).astype(np.float32), np.where(known, in_the_way, UNKNOWN).astype(
-            np.uint8
-        )
+        factor, in_the_way = np.where(known, factor, self._unknown), np.where(known, in_the_way, UNKNOWN)
+        return factor.astype(np.float32), in_the_way.astype(np.uint8)
