@@ -25,11 +25,10 @@ INK, PALE, SHADE = "#222222", "#8a8a8a", "#d9d9d9"
 
 PACKAGES = [
     {"commands": "parse, call the library, print", "experiments": "the paper's, and a comparison"},
-    {"training": "the trainer and its step; evaluation on test maps", "physics": "trajectories driven in MuJoCo"},
+    {"training": "trainer and step; evaluation", "physics": "MuJoCo", "plan_results": "paths: files, figures"},
+    {"planning": "paths on whole sites, or why there is none"},
     {"runs": "a run on disk: checkpoints, model file, predictors"},
-    {"estimators": "presets, samples, losses", "plan_results": "files and figures of paths"},
-    {"planning": "paths, and why not"},
-    {"site": "maps of whole sites"},
+    {"estimators": "presets, samples, losses", "site": "maps of whole sites"},
     {"evaluation": "scores, tables, figures"},
     {"data": "windows of real sites, samples, splits, data sets"},
     {"point_clouds": "LAS, LAZ, PLY, PCD, text, meshes"},

@@ -3,6 +3,7 @@
 import argparse
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 from travjax import options, progress
@@ -43,6 +44,16 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--primitives", type=user_path, metavar="FILE", help=".toml file of what the robot may do and what that costs"
     )
+    parser.add_argument(
+        "--estimator",
+        type=user_path,
+        metavar="FILE",
+        help="judge motions by this hazard field, a .safetensors file or the folder of a run, instead of by margins: its "
+        "probability is the risk, and above --threshold it forbids a motion; for noisy maps",
+    )
+    parser.add_argument(
+        "--threshold", type=float, default=0.5, metavar="P", help="probability of failure that is too much (0.5)"
+    )
     parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
     parser.add_argument(
         "--stride",
@@ -75,10 +86,12 @@ def add(commands: options.Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Plans the path and writes the results; returns the exit code."""
     from travjax.plan_results.plan_report import save_no_path, save_plan, save_to_go
+    from travjax.planning.field_judge import FieldJudge
     from travjax.planning.motions import Motions
     from travjax.planning.no_path import NoPathError
     from travjax.planning.planner import Planner
     from travjax.planning.to_go import CostToGo
+    from travjax.runs.predictor import Predictor
     from travjax.simulation.contact import spacing_note
     from travjax.site.ground import SiteGround
     from travjax.site.mapping import coarse_note
@@ -95,15 +108,22 @@ def run(arguments: argparse.Namespace) -> int:
         fill_holes=not arguments.keep_holes,
         allow_coarse=arguments.allow_coarse,
     )
+    judge, contact = None, arguments.contact
+    if arguments.estimator:
+        require(arguments.unknown_cost is None, "--unknown-cost", arguments.unknown_cost, "left out with --estimator")
+        predictor = Predictor.load(arguments.estimator)
+        judge = partial(FieldJudge, predictor=predictor, threshold=arguments.threshold)
+        contact = contact or predictor.run.setup.contact.model
     planner = Planner(
         site,
         arguments.robot,
         motions,
         headings=arguments.headings,
         stride=arguments.stride,
-        contact=arguments.contact,
+        contact=contact,
         interval=arguments.interval,
         unknown_cost=arguments.unknown_cost,
+        judge=judge,
     )
     setup = planner.setup
     for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):

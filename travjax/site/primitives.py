@@ -49,6 +49,11 @@ class Primitive:
             at = arc[-1]
         return np.concatenate(along)
 
+    def radii(self, interval: float) -> Float[np.ndarray, " p"]:
+        """Returns the radius of the arc that each of the poses lies on, of the first arc where two meet."""
+        counts = [len(stations(length, interval)) + (number == 0) for number, (_, length) in enumerate(self.arcs)]
+        return np.repeat([radius for radius, _ in self.arcs], counts)
+
 
 @dataclass(frozen=True)
 class PointTurn:
@@ -70,6 +75,10 @@ class PointTurn:
         poses = np.zeros((self.parts + 1, 3))
         poses[:, 2] = self.heading + np.linspace(0, self.angle, self.parts + 1)
         return poses
+
+    def radii(self, interval: float) -> Float[np.ndarray, " p"]:
+        """Returns inf for each of the poses, as if the robot had come straight to it."""
+        return np.full(self.parts + 1, math.inf)
 
 
 def straight_passes(headings: int = 16, stride: float = 0.25) -> tuple[Primitive, ...]:
