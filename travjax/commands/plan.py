@@ -48,7 +48,7 @@ def add(commands: options.Commands) -> None:
         "--estimator",
         type=user_path,
         metavar="FILE",
-        help="judge motions by this hazard field, a .safetensors file or the folder of a run, instead of by margins: its "
+        help="judge motions by this hazard field, a .safetensors file or the folder of a run, instead of margins: its "
         "probability is the risk, and above --threshold it forbids a motion; for noisy maps",
     )
     parser.add_argument(
