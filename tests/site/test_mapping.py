@@ -1,5 +1,6 @@
 """Maps of sites: costs and bands by the letter of SPEC section 13, files as GIS and Nav2 read them, and going on."""
 
+import importlib.util
 import math
 import os
 import signal
@@ -190,6 +191,13 @@ def test_xarray_gets_names_and_coordinates():
     pytest.importorskip("xarray", reason="xarray is not installed")
     data = map_site(np.zeros((40, 50)), headings=4).to_xarray()
     assert data["cost"].dims == ("heading", "y", "x") and data["heading"].values.tolist() == [0, 90, 180, 270]
+
+
+def test_a_missing_xarray_is_named(monkeypatch):
+    found = map_site(np.zeros((40, 50)), "leo_rover", headings=1)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r'^xarray: not installed; needed: pip install "travjax\[xarray\]"$'):
+        found.to_xarray()
 
 
 def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_path, monkeypatch, mapped):

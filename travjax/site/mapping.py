@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from travjax import progress
-from travjax.config import one_line, require, require_length, require_number, to_json
+from travjax.config import one_line, require, require_installed, require_length, require_number, to_json
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, held, output_folder, resolved, save_text
@@ -54,7 +54,11 @@ class SiteMap:
         return _shares(self.bands["passable_headings"], self.bands["known_headings"])
 
     def to_xarray(self):
-        """Returns an xarray.Dataset with the bands, `cost` and `elevation`; xarray has to be installed."""
+        """Returns an xarray.Dataset with the bands, `cost` and `elevation`.
+
+        Raises InputError that says how to install xarray where it is missing.
+        """
+        require_installed("xarray", "xarray", "xarray")
         import xarray
 
         values: dict[str, tuple] = {name: (("y", "x"), band) for name, band in self.bands.items()}
