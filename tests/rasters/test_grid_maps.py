@@ -142,7 +142,7 @@ def test_the_latest_map_is_read_unless_a_time_is_given(tmp_path):
     ("settings", "options", "message"),
     [
         ({}, {"layer": "height"}, "layer = 'height': must be elevation or variance"),
-        ({}, {}, r"layer = \['elevation', 'variance'\]: must be chosen \(--layer\)"),
+        ({}, {}, r"layer: must be chosen \(--layer\): elevation or variance$"),
         ({}, {"layer": "elevation", "topic": "/map"}, "topic = '/map': must be /grid_map"),
         ({"turn": 0.2}, {"layer": "elevation"}, "pose, orientation = 11.459: must be 0 degrees"),
     ],
@@ -151,6 +151,19 @@ def test_what_has_to_be_chosen_is_named(tmp_path, settings, options, message):
     path = recorded(tmp_path / "map.mcap", [{"elevation": heights(), "variance": heights()}], **settings)
     with pytest.raises(InputError, match=message):
         read(path, **options)
+
+
+def test_all_layers_are_listed_unless_they_are_very_many(tmp_path):
+    names = [f"uncertainty_of_kind_{number}" for number in range(12)]
+    write_grid_map(tmp_path / "few.mcap", dict.fromkeys(names, heights()), CELL, (0.0, 0.0))
+    with pytest.raises(InputError, match=rf"--layer\): {' or '.join(names)}$"):
+        read(tmp_path / "few.mcap")
+    with pytest.raises(InputError, match=rf"^layer = 'other': must be {' or '.join(names)}$"):
+        read(tmp_path / "few.mcap", layer="other")
+    many = [f"layer_{number}" for number in range(200)]
+    write_grid_map(tmp_path / "many.mcap", dict.fromkeys(many, heights()), CELL, (0.0, 0.0))
+    with pytest.raises(InputError, match=r"layer_0 or layer_1 or .* or layer_\d+ \.\.\. \(200 in all\)$"):
+        read(tmp_path / "many.mcap")
 
 
 def test_other_recordings_and_damaged_ones_are_one_line(tmp_path):

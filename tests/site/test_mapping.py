@@ -1,7 +1,9 @@
 """Maps of sites: costs and bands by the letter of SPEC section 13, files as GIS and Nav2 read them, and going on."""
 
+import importlib.util
 import math
 import os
+import re
 import signal
 from dataclasses import replace
 
@@ -21,6 +23,7 @@ from travjax.site.ground import ArrayGround, SiteGround
 from travjax.site.kernel import simulate_site
 from travjax.site.mapping import map_site, save_map, setup_of
 from travjax.site.primitives import straight_passes
+from travjax.site.site_figures import EVENT_COLOURS
 from travjax.site.store import FOLDER
 
 rasterio = pytest.importorskip("rasterio", reason="the extra geo is not installed")
@@ -123,6 +126,24 @@ def test_the_geotiffs_lie_where_the_site_does_and_hold_the_simulated_margins(map
     assert len(np.unique(found)) > 5 and (found == 100).any() and (found == 255).any()
 
 
+def test_what_blocks_has_colours_and_names(mapped):
+    out, _ = mapped
+    with rasterio.open(out / "map.tif") as file:
+        wanted = np.nan_to_num(file.read(8), nan=255)
+    with rasterio.open(out / "blocking.tif") as file:
+        codes, colours = file.read(1), file.colormap(1)
+        assert file.dtypes == ("uint8",) and file.nodata == 255 and file.descriptions == ("blocking_event",)
+        assert file.crs.to_epsg() == 32632 and file.colorinterp[0].name == "palette"
+        assert file.xy(file.height - 1, 0) == pytest.approx((EASTING, NORTHING))
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG" and not file.dataset_mask().all()
+    np.testing.assert_array_equal(codes, wanted)
+    assert {0, 255} < set(np.unique(codes).tolist())
+    assert ["#" + bytes(colours[code][:3]).hex() for code in range(4)] == list(EVENT_COLOURS[:4])
+    rasterio.shutil.copy(out / "blocking.tif", out / "copy.vrt", driver="VRT")
+    names = re.findall("<Category>(.*?)</Category>", (out / "copy.vrt").read_text())
+    assert names == ["none", "step", "obstacle", "tilt"]
+
+
 def decoded(yaml) -> tuple[np.ndarray, dict[str, str]]:
     """Reads a map as Nav2's map_io does: [rows, cols] from the south-west, 0 to 100 and -1."""
     said = dict(line.split(": ", 1) for line in yaml.read_text().splitlines())
@@ -190,6 +211,13 @@ def test_xarray_gets_names_and_coordinates():
     pytest.importorskip("xarray", reason="xarray is not installed")
     data = map_site(np.zeros((40, 50)), headings=4).to_xarray()
     assert data["cost"].dims == ("heading", "y", "x") and data["heading"].values.tolist() == [0, 90, 180, 270]
+
+
+def test_a_missing_xarray_is_named(monkeypatch):
+    found = map_site(np.zeros((40, 50)), "leo_rover", headings=1)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r'^xarray: not installed; needed: pip install "travjax\[xarray\]"$'):
+        found.to_xarray()
 
 
 def test_a_run_that_was_stopped_goes_on_with_the_missing_tiles(site_file, tmp_path, monkeypatch, mapped):
@@ -300,10 +328,8 @@ def test_a_margin_just_above_its_limit_fails():
 
 
 def test_the_site_itself_is_not_overwritten(site_file, tmp_path):
-    own = tmp_path / "map.tif"
-    own.write_bytes(site_file.read_bytes())
-    for more in ((), ("--method", "geometric")):
-        written = tmp_path / ("map.tif" if not more else "geometric.tif")
+    for name, more in (("map.tif", ()), ("blocking.tif", ()), ("geometric.tif", ("--method", "geometric"))):
+        written = tmp_path / name
         written.write_bytes(site_file.read_bytes())
         code, _, err = run_words("map", written, "--headings", 1, "--out", tmp_path, *more)
         assert code == 2 and f"--out = {str(tmp_path)!r}: must be a folder other than that of the site" in err

@@ -35,6 +35,9 @@ uint16 inner_start_index
 }
 """Of the messages as ROS 2 has them, for recordings that do not carry them."""
 
+LISTED = 400
+"""Characters of names that a message lists, at most."""
+
 TURNED = 1e-3
 """Radians, the largest angle of a map's pose that counts as none."""
 
@@ -79,12 +82,8 @@ def _message(reader: Any, options: DemOptions) -> Any:
     """Returns the message to use."""
     found = [one for one in reader.connections if one.msgtype == TYPE]
     require(bool(found), "topics", sorted({one.msgtype for one in reader.connections}), f"some of type {TYPE}")
-    topics = sorted({one.topic for one in found})
-    if options.topic is None:
-        require(len(topics) == 1, "topic", topics, "chosen (--topic)")
-    else:
-        require(options.topic in topics, "topic", options.topic, " or ".join(topics))
-        found = [one for one in found if one.topic == options.topic]
+    topic = _chosen("topic", options.topic, sorted({one.topic for one in found}))
+    found = [one for one in found if one.topic == topic]
     until = math.inf if options.time is None else reader.start_time + 1e9 * options.time
     latest = None
     for connection, time, raw in reader.messages(connections=found):
@@ -99,11 +98,8 @@ def _message(reader: Any, options: DemOptions) -> Any:
 
 def _raster(message: Any, options: DemOptions) -> Raster:
     layers = list(message.layers)
-    if options.layer is None:
-        require(len(layers) == 1, "layer", layers, "chosen (--layer)")
-    else:
-        require(options.layer in layers, "layer", options.layer, " or ".join(layers))
-    info, index = message.info, layers.index(options.layer or layers[0])
+    require(len(layers) > 0, "layers", layers, "at least one")
+    info, index = message.info, layers.index(_chosen("layer", options.layer, layers))
     turned = info.pose.orientation
     angle = 2 * math.atan2(math.hypot(turned.x, turned.y, turned.z), abs(turned.w)) if turned.w or turned.z else 0.0
     require(angle < TURNED, "pose, orientation", round(math.degrees(angle), 3), "0 degrees; turn the map first")
@@ -116,6 +112,18 @@ def _raster(message: Any, options: DemOptions) -> Raster:
     frame = str((message if hasattr(message, "header") else info).header.frame_id)  # it lies in ROS 1 within info
     values = InMetres(np.ascontiguousarray(heights), scale, nodata=options.nodata)
     return Raster(values, cell_size, origin, None, (f"frame {frame!r}",), frame=frame)
+
+
+def _chosen(what: str, given: str | None, names: list[str]) -> str:
+    """Returns the given name, or the only one there is; raises InputError that lists the names."""
+    listed = " or ".join(names)
+    if len(listed) > LISTED:
+        listed = f"{listed[:LISTED].rpartition(' or ')[0] or listed[:LISTED]} ... ({len(names)} in all)"
+    if given is None and len(names) > 1:
+        raise InputError(f"{what}: must be chosen (--{what}): {listed}")
+    name = names[0] if given is None else given
+    require(name in names, what, name, listed)
+    return name
 
 
 def _unrolled(layer: Any, outer: int, inner: int) -> np.ndarray:

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from xml.sax.saxutils import escape
 
 import numpy as np
 
 from travjax.config import InputError, require_installed
-from travjax.files import atomic_write
+from travjax.files import atomic_write, save_text
 
 STRIP = 512
 """Rows that are written at once."""
@@ -48,10 +49,13 @@ def save_geotiff(
     frame: Frame,
     nodata: float,
     tags: Mapping[str, Any] | None = None,
+    colours: Mapping[str, str] | None = None,
 ) -> Path:
     """Writes bands [b, rows, cols], row 0 in the north, whole or not at all.
 
-    names: descriptions of the bands; tags: what else to say in the file
+    names:   descriptions of the bands; tags: what else to say in the file
+    colours: "#rrggbb" of the values 0, 1, 2 ... of a single band of bytes, by what these stand for; their names go to a
+             file beside it, NAME.tif.aux.xml, where GDAL looks for them
     Raises InputError when it cannot be written.
     """
     engine = rasterio()
@@ -73,6 +77,8 @@ def save_geotiff(
     with _input_error(path), atomic_write(path) as temporary, engine.Env(GDAL_PAM_ENABLED=False):
         plain = temporary.with_name("plain.tif")
         with engine.open(plain, "w", crs=frame.crs, **profile) as file:
+            if colours:
+                file.write_colormap(1, {code: tuple(bytes.fromhex(c[1:])) for code, c in enumerate(colours.values())})
             for top in range(0, rows, STRIP):
                 strip = np.ascontiguousarray(bands[:, top : top + STRIP])
                 file.write(strip, window=engine.windows.Window(0, top, cols, strip.shape[1]))
@@ -89,6 +95,10 @@ def save_geotiff(
             overview_resampling="nearest",
             bigtiff="if_safer",
         )
+    if colours:
+        categories = "".join(f"<Category>{escape(name)}</Category>" for name in colours)
+        band = f'<PAMRasterBand band="1"><CategoryNames>{categories}</CategoryNames></PAMRasterBand>'
+        save_text(path.with_name(f"{path.name}.aux.xml"), f"<PAMDataset>{band}</PAMDataset>\n")
     return path
 
 

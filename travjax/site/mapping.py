@@ -5,12 +5,13 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from travjax import progress
-from travjax.config import one_line, require, require_length, require_number, to_json
+from travjax.config import one_line, require, require_installed, require_length, require_number, to_json
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, held, output_folder, resolved, save_text
@@ -28,6 +29,9 @@ from travjax.site.nav2 import over_headings, save_nav2
 from travjax.site.primitives import straight_passes
 from travjax.site.store import Store
 from travjax.site.tiling import executor, parts_of
+
+UNKNOWN_EVENT = 255
+"""Stands in blocking.tif for places without a known heading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +58,11 @@ class SiteMap:
         return _shares(self.bands["passable_headings"], self.bands["known_headings"])
 
     def to_xarray(self):
-        """Returns an xarray.Dataset with the bands, `cost` and `elevation`; xarray has to be installed."""
+        """Returns an xarray.Dataset with the bands, `cost` and `elevation`.
+
+        Raises InputError that says how to install xarray where it is missing.
+        """
+        require_installed("xarray", "xarray", "xarray")
         import xarray
 
         values: dict[str, tuple] = {name: (("y", "x"), band) for name, band in self.bands.items()}
@@ -123,7 +131,7 @@ def save_map(
     grid_map: Path | None = None,
     scheduler: str | None = None,
 ) -> Path:
-    """Maps a site and writes map.tif, headings.tif, the maps for Nav2, figures and shares; returns the folder.
+    """Maps a site and writes GeoTIFFs, the maps for Nav2, figures and shares; returns the folder.
 
     Memory does not grow with the site; a run that was stopped goes on with the tiles that are missing.
     grid_map:  file of ROS 2, .mcap or .db3, that gets the bands and the elevation as layers of a GridMap
@@ -135,7 +143,8 @@ def save_map(
         rosbags()
         fits = grid_map.suffix in (".mcap", ".db3") and grid_map.parent.is_dir() and not grid_map.is_dir()
         require(fits, "--grid-map", str(grid_map), "a file in a folder that exists, its name ending in .mcap or .db3")
-    require_not_written(site, [Path(out) / "map.tif", Path(out) / "headings.tif", *([grid_map] if grid_map else [])])
+    rasters = [Path(out) / name for name in ("map.tif", "headings.tif", "blocking.tif")]
+    require_not_written(site, [*rasters, *([grid_map] if grid_map else [])])
     with executor(scheduler) as pool, held(folder := output_folder(out)):
         store = _simulated(site, setup, folder, pool)
         written = _written(store, site, setup, folder)
@@ -197,11 +206,20 @@ def _written(store: Store, site: SiteGround, setup: SiteSetup, folder: Path) -> 
     return [
         save_geotiff(folder / "map.tif", store.bands, names, frame, float("nan"), tags),
         save_geotiff(folder / "headings.tif", store.costs, layers, frame, UNKNOWN_COST, tags),
+        _save_blocking(folder / "blocking.tif", bands["blocking_event"], setup.robot, frame, tags),
         *save_nav2(folder / "nav2", over_headings(store.costs), frame),
         map_figures.save(passable, folder / "map.png"),
         map_figures.save(blocking, folder / "why.png"),
         save_text(folder / "shares.txt", f"{heading}\n{table}\n"),
     ]
+
+
+def _save_blocking(path: Path, blocking: np.ndarray, robot: Robot, frame: Frame, tags: Mapping[str, Any]) -> Path:
+    """Writes the numbers of blocking events [rows, cols] as bytes with the colours of why.png and their names."""
+    codes = np.full((1, *blocking.shape), UNKNOWN_EVENT, np.uint8)
+    np.copyto(codes[0], blocking, where=~np.isnan(blocking), casting="unsafe")
+    colours = dict(zip(("none", *robot.event_names), site_figures.EVENT_COLOURS, strict=False))
+    return save_geotiff(path, codes, ("blocking_event",), frame, UNKNOWN_EVENT, tags, colours)
 
 
 def _save_grid_map(path: Path, store: Store, site: SiteGround, setup: SiteSetup) -> Path:
