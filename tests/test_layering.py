@@ -21,7 +21,7 @@ LAYERS = {
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
     "site": "primitives ground kernel costs tiling geotiff nav2 store site_figures mapping geometric site_benchmark",
-    "planning": "biarcs motions path costs endpoints search no_path planner",
+    "planning": "biarcs motions path costs endpoints search no_path planner action_space",
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "training": "step trainer fit evaluation_report network_benchmark",
