@@ -51,7 +51,7 @@ def endpoint(name: str, given: Any, costs: MotionCosts, coordinates: str = "site
         require_number(name, number, -1e12, 1e12, "finite numbers")
     point = tuple(float(number) for number in given)
     ground, stride = costs.ground, costs.lattice.stride
-    x, y = _on_site(name, point, ground, coordinates)
+    x, y = on_site(name, point, ground, coordinates)
     row, col = (
         math.floor((value - start) / stride + 0.5) for value, start in ((y, ground.origin[1]), (x, ground.origin[0]))
     )
@@ -68,7 +68,8 @@ def endpoint(name: str, given: Any, costs: MotionCosts, coordinates: str = "site
     return Endpoint(name, point, row, col, *at, heading)
 
 
-def _on_site(name: str, point: tuple[float, ...], ground: Site, coordinates: str) -> tuple[float, float]:
+def on_site(name: str, point: tuple[float, ...], ground: Site, coordinates: str) -> tuple[float, float]:
+    """Returns a point in coordinates of the site; raises InputError where it cannot be one."""
     if coordinates == "rowcol":
         return ground.origin[0] + point[1] * ground.spacing, ground.origin[1] + point[0] * ground.spacing
     if coordinates == "site":

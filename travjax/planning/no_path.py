@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Int, UInt8
 from scipy.ndimage import binary_dilation
 
 from travjax.planning.costs import MotionCosts
@@ -44,18 +44,28 @@ def no_path(start: Endpoint, goal: Endpoint, costs: MotionCosts, search: Search 
     """
     by_state = search is not None and math.isfinite(search.bound[start.row, start.col])
     places, counts = _by_states(search, costs) if by_state and search else _by_places(start, costs)
+    reached = reached_places(places, counts, goal, costs)
+    return NoPathError(_message(start, goal, reached, by_state, costs), reached, start, goal)
+
+
+def reached_places(
+    places: Bool[np.ndarray, "rows cols"],
+    counts: Int[np.ndarray, "codes rows cols"],
+    goal: Endpoint,
+    costs: MotionCosts,
+) -> Reached:
+    """Returns what is reached, from the places and how often each event is in the way next to them, unknown last."""
     codes = [0, *range(1, 1 + len(costs.robot.events)), UNKNOWN]
     frontier = np.array(codes, np.uint8)[np.where(counts.any(axis=0), 1 + counts.argmax(axis=0), 0)]
     rows, cols = np.nonzero(places)
-    away = np.hypot(rows - goal.row, cols - goal.col) * costs.lattice.stride
-    best = int(away.argmin())
-    reached = Reached(places, frontier, (int(rows[best]), int(cols[best])))
-    return NoPathError(_message(start, goal, reached, float(away[best]), by_state, costs), reached, start, goal)
+    best = int(np.hypot(rows - goal.row, cols - goal.col).argmin())
+    return Reached(places, frontier, (int(rows[best]), int(cols[best])))
 
 
-def _message(start: Endpoint, goal: Endpoint, reached: Reached, away: float, by_state: bool, costs: MotionCosts) -> str:
+def _message(start: Endpoint, goal: Endpoint, reached: Reached, by_state: bool, costs: MotionCosts) -> str:
     stride, (x, y) = costs.lattice.stride, costs.ground.origin
     row, col = reached.nearest
+    away = math.hypot(row - goal.row, col - goal.col) * stride
     whatever = "" if by_state else ", even if headings did not matter"
     text = (
         f"no path from {start.name} {place_text(start.x, start.y)} to {goal.name} {place_text(goal.x, goal.y)}: "
@@ -79,9 +89,14 @@ def _by_places(start: Endpoint, costs: MotionCosts) -> tuple[np.ndarray, np.ndar
     """
     from_start = bounds(costs.lattice, costs.easiest, [start.row * costs.shape[1] + start.col], forwards=True)
     places = np.isfinite(from_start)
+    return places, standing_beside(places, costs)
+
+
+def standing_beside(places: Bool[np.ndarray, "rows cols"], costs: MotionCosts) -> Int[np.ndarray, "codes rows cols"]:
+    """Returns how often, over the headings, each event keeps the robot from standing next to places, unknown last."""
     beside = binary_dilation(places, np.ones((3, 3))) & ~np.isfinite(costs.easiest)
     codes = (*range(1, 1 + len(costs.robot.events)), UNKNOWN)
-    return places, np.stack([(costs.standing[1] == code).sum(axis=0) for code in codes]) * beside
+    return np.stack([(costs.standing[1] == code).sum(axis=0) for code in codes]) * beside
 
 
 def _by_states(search: Search, costs: MotionCosts) -> tuple[np.ndarray, np.ndarray]:

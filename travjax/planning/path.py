@@ -1,9 +1,10 @@
 """A path: poses that follow each other, and what the sequential simulators say about each of them."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,6 +20,21 @@ WINDOW = 5.0
 
 TOLERANCE = 1e-6
 """Share of a limit by which rounding may lift a margin above it."""
+
+
+class Stretch(Protocol):
+    """A part of a path, whatever planner it is of: poses that follow each other, the first being the last before it."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def turning(self) -> bool:
+        """Whether the robot turns on the spot."""
+
+    def poses(self, interval: float, stride: float) -> Float[np.ndarray, "p 3"]:
+        """Returns its poses, x and y in metres from the site's south-west node."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +64,26 @@ class Leg:
         return poses[::-1] if self.backwards else poses
 
 
+@dataclass(frozen=True, eq=False)
+class PosedLeg:
+    """A part of a path that keeps to no lattice.
+
+    name:    what it is called; turning: whether the robot turns on the spot
+    at:      [p, 3] its poses, x and y in metres from the site's south-west node
+    length:  metres; turned: radians, all turning to the left and right added up
+    """
+
+    name: str
+    turning: bool
+    at: Float[np.ndarray, "p 3"]
+    length: float
+    turned: float
+
+    def poses(self, interval: float, stride: float) -> Float[np.ndarray, "p 3"]:
+        """Returns its poses, which no interval and no stride change."""
+        return self.at
+
+
 @dataclass(frozen=True)
 class Path:
     """A path, as the sequential simulators see it; p poses.
@@ -58,6 +94,7 @@ class Path:
     motion:   [p] names of the motion that leads to each pose
     step, obstacle, tilt: [p] metres and radians; step is that from the pose before, 0 at the first one and in turns
     known:    [p] whether all ground that is touched is known
+    share:    [p] the largest margin as a share of its limit, of all events of the robot; NaN on unknown ground
     exceeds:  [p] whether a limit of the robot is exceeded
     """
 
@@ -69,6 +106,7 @@ class Path:
     obstacle: Float[np.ndarray, " p"]
     tilt: Float[np.ndarray, " p"]
     known: Bool[np.ndarray, " p"]
+    share: Float[np.ndarray, " p"]
     exceeds: Bool[np.ndarray, " p"]
 
     @property
@@ -77,7 +115,9 @@ class Path:
         return float(self.distance[-1])
 
 
-def drive(legs: list[Leg], start: Float[np.ndarray, " 3"], ground: Site, setup: SiteSetup) -> tuple[Path, list[int]]:
+def drive(
+    legs: Sequence[Stretch], start: Float[np.ndarray, " 3"], ground: Site, setup: SiteSetup
+) -> tuple[Path, list[int]]:
     """Simulates the poses of legs by the sequential simulators.
 
     start: pose where the path begins, and the first leg if there is one, from the site's south-west node
@@ -97,17 +137,15 @@ def drive(legs: list[Leg], start: Float[np.ndarray, " 3"], ground: Site, setup: 
     step[0] = np.where(known[0], 0, np.nan)
     values = {"step": step, "obstacle": obstacle, "tilt": tilt, "roll": np.abs(roll)}
     robot = setup.robot
-    over = [
-        values[event.name] > limit * (1 + TOLERANCE) for event, limit in zip(robot.events, robot.limits, strict=True)
-    ]
+    shares = [values[event.name] / limit for event, limit in zip(robot.events, robot.limits, strict=True)]
+    share = np.fmax.reduce(shares)  # a step from unknown ground is not known, the other margins are
     along = np.hypot(*np.diff(poses[:, :2], axis=0).T)
     shift = np.array([*ground.origin, 0.0])
     pose = poses + shift
     pose[:, 2] %= 2 * math.pi
     distance = _arc_lengths(poses, along)
-    return Path(
-        pose, z + ground.height_offset, distance, names, step, obstacle, tilt, known, np.any(over, axis=0)
-    ), owner
+    exceeds = share > 1 + TOLERANCE
+    return Path(pose, z + ground.height_offset, distance, names, step, obstacle, tilt, known, share, exceeds), owner
 
 
 def _arc_lengths(poses: np.ndarray, chords: np.ndarray) -> np.ndarray:

@@ -16,7 +16,7 @@ from travjax.planning.endpoints import Endpoint, endpoint, standing, why_not_sta
 from travjax.planning.judges import Judge, MarginJudge
 from travjax.planning.motions import MotionLattice, Motions
 from travjax.planning.no_path import NoPathError, no_path
-from travjax.planning.path import Leg, Path, drive
+from travjax.planning.path import Leg, Path, Stretch, drive
 from travjax.planning.search import Search, bounds
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
@@ -41,7 +41,7 @@ class Plan:
     """
 
     path: Path
-    legs: tuple[Leg, ...]
+    legs: tuple[Stretch, ...]
     cost: float
     points: tuple[Endpoint, ...]
     checks: Mapping[str, int]
