@@ -13,11 +13,12 @@ from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY, SETUP
 from travjax.data.dataset import DatasetConfig
 from travjax.data.provenance import SitesConfig
+from travjax.data.sensor_noise import CORRUPTIONS, FILTERS
 from travjax.estimators.names import ESTIMATORS
 from travjax.estimators.preset import Preset
 from travjax.evaluation.metrics import OVERALL, Confusion
 from travjax.experiments import comparison
-from travjax.experiments.robustness import CORRUPTIONS, FILTERS, BenchmarkMaps, of_sites
+from travjax.experiments.robustness import BenchmarkMaps, of_sites
 from travjax.experiments.robustness_scores import (
     FILTERED,
     HAZARD,

@@ -7,17 +7,9 @@ from tests.commandline import FEW
 from tests.field_runs import RUN, estimator
 from tests.small_training import GRID, HUSKY, SETUP
 from travjax.data.provenance import Site, SitesConfig
+from travjax.data.sensor_noise import CLEAN, CORRUPTIONS, FILTERS
 from travjax.evaluation.metrics import OVERALL
-from travjax.experiments.robustness import (
-    CLEAN,
-    CORRUPTIONS,
-    FILTERS,
-    BenchmarkMaps,
-    average_precisions,
-    by_margins,
-    of_samples,
-    of_sites,
-)
+from travjax.experiments.robustness import BenchmarkMaps, average_precisions, by_margins, of_samples, of_sites
 from travjax.runs.predictor import Predictor
 from travjax.traversal.traverse import simulate
 

@@ -1,9 +1,11 @@
-"""Simulated sensor errors in elevation maps (noise, missing nodes, a coarser grid), and repairs of missing nodes.
+"""Simulated sensor errors in elevation maps (noise, missing nodes, a coarser grid), repairs of them, and filters.
 
 Everything is NumPy on the host. Maps are [n, rows, cols] metres.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -95,3 +97,42 @@ def smoothed(maps: Maps, deviation: float) -> Maps:
 def median(maps: Maps) -> Maps:
     """Replaces each height by the median of the 3 x 3 nodes around it."""
     return ndimage.median_filter(maps, (1, 3, 3), mode="nearest")
+
+
+NOISES = (0.01, 0.02, 0.05)
+"""Standard deviations of the noise that is added, in metres."""
+
+MISSING = (0.05, 0.2)
+"""Shares of nodes that are missing."""
+
+CLEAN, COARSE = "none", "0.125 m"
+
+GAUSSIANS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
+"""Standard deviations, in nodes, of the Gaussian filters for the simulator's map."""
+
+
+Corruption = Callable[[Maps, np.random.Generator], Maps]
+
+
+def _noise(deviation: float) -> Corruption:
+    return lambda maps, rng: noisy(maps, deviation, rng)
+
+
+def _missing(share: float) -> Corruption:
+    return lambda maps, rng: filled(thinned(maps, share, rng))
+
+
+CORRUPTIONS: dict[str, Corruption] = {
+    CLEAN: lambda maps, rng: maps,
+    **{f"noise {100 * noise:g} cm": _noise(noise) for noise in NOISES},
+    **{f"{share:.0%} missing": _missing(share) for share in MISSING},
+    COARSE: lambda maps, rng: upsampled(maps),
+}
+"""Corruptions of maps by name: each shows the maps as a sensor may see them, with all nodes known."""
+
+FILTERS: dict[str, Callable[[Maps], Maps]] = {
+    "no filter": lambda maps: maps,
+    "median 3 x 3": median,
+    **{f"Gaussian {nodes:g}": partial(smoothed, deviation=nodes) for nodes in GAUSSIANS},
+}
+"""Filters by name that may be applied to a corrupted map before it is simulated; deviations in nodes."""

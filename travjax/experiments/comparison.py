@@ -17,12 +17,13 @@ from typing import Any
 from travjax import progress
 from travjax.config import InputError, require, to_json
 from travjax.data.provenance import SitesConfig
+from travjax.data.sensor_noise import CLEAN, CORRUPTIONS
 from travjax.estimators.names import FIELD, RESNET
 from travjax.evaluation import map_figures, metrics, simulator_benchmark
 from travjax.evaluation.metrics import OVERALL
 from travjax.evaluation.tables import rows_table
 from travjax.experiments import launch, timing
-from travjax.experiments.robustness import CLEAN, CORRUPTIONS, BenchmarkMaps, of_sites
+from travjax.experiments.robustness import BenchmarkMaps, of_sites
 from travjax.experiments.robustness_scores import (
     FILTERED,
     HAZARD,

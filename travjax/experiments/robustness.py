@@ -5,16 +5,16 @@ A method turns maps [n, rows, cols] into failure scores [n, t, k]; a score of 0.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from travjax.data import sensor_noise, sites
+from travjax.data import sites
 from travjax.data.dataset import DatasetConfig
 from travjax.data.map_batches import Batch, joined, labelled, synthetic_batches
 from travjax.data.provenance import SitesConfig
 from travjax.data.sampling import Samples
+from travjax.data.sensor_noise import CORRUPTIONS, FILTERS, Maps, filled
 from travjax.devices import Devices
 from travjax.estimators.inference import Placed, probabilities
 from travjax.evaluation.metrics import OVERALL, Confusion, average_precision, confusions
@@ -24,47 +24,8 @@ from travjax.simulation.robot import Robot
 from travjax.simulation.setup import Setup
 from travjax.traversal.traverse import margins_of
 
-Maps = Float[np.ndarray, "n rows cols"]
 Fails = Float[np.ndarray, "*m k"]
 Progress = Callable[[int], object]
-
-NOISES = (0.01, 0.02, 0.05)
-"""Standard deviations of the noise that is added, in metres."""
-
-MISSING = (0.05, 0.2)
-"""Shares of nodes that are missing."""
-
-CLEAN, COARSE = "none", "0.125 m"
-
-GAUSSIANS = (0.5, 0.75, 1.0, 1.25, 1.5, 2.0)
-"""Standard deviations, in nodes, of the Gaussian filters for the simulator's map."""
-
-
-Corruption = Callable[[Maps, np.random.Generator], Maps]
-
-
-def _noise(deviation: float) -> Corruption:
-    return lambda maps, rng: sensor_noise.noisy(maps, deviation, rng)
-
-
-def _missing(share: float) -> Corruption:
-    return lambda maps, rng: sensor_noise.filled(sensor_noise.thinned(maps, share, rng))
-
-
-CORRUPTIONS: dict[str, Corruption] = {
-    CLEAN: lambda maps, rng: maps,
-    **{f"noise {100 * noise:g} cm": _noise(noise) for noise in NOISES},
-    **{f"{share:.0%} missing": _missing(share) for share in MISSING},
-    COARSE: lambda maps, rng: sensor_noise.upsampled(maps),
-}
-"""Corruptions of maps by name: each shows the maps as a sensor may see them, with all nodes known."""
-
-FILTERS: dict[str, Callable[[Maps], Maps]] = {
-    "no filter": lambda maps: maps,
-    "median 3 x 3": sensor_noise.median,
-    **{f"Gaussian {nodes:g}": partial(sensor_noise.smoothed, deviation=nodes) for nodes in GAUSSIANS},
-}
-"""Filters by name that may be applied to a corrupted map before it is simulated; deviations in nodes."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +66,7 @@ class BenchmarkMaps:
     @staticmethod
     def _from_batch(maps: Batch, setup: Setup) -> "BenchmarkMaps":
         margins = np.stack([maps[event] for event in setup.robot.event_names], axis=-1)
-        heights = sensor_noise.filled(maps["heights"])
+        heights = filled(maps["heights"])
         return BenchmarkMaps(heights, maps["known"], maps["failed"], margins, setup)
 
     def seen(self, name: str, seed: int) -> Maps:

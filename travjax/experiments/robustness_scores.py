@@ -9,13 +9,11 @@ from matplotlib.figure import Figure
 
 from travjax import progress
 from travjax.data.sampling import Samples
+from travjax.data.sensor_noise import CLEAN, CORRUPTIONS, FILTERS
 from travjax.evaluation import metrics
 from travjax.evaluation.metrics import OVERALL, THRESHOLD, Confusion
 from travjax.evaluation.tables import rows_table
 from travjax.experiments.robustness import (
-    CLEAN,
-    CORRUPTIONS,
-    FILTERS,
     BenchmarkMaps,
     Progress,
     average_precisions,
