@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from travjax.config import InputError
 from travjax.files import atomic_write, output_folder, save_text
@@ -129,8 +129,10 @@ def save_ros_path(file: FilePath, plan: Plan, planner: Planner) -> FilePath:
     """
     require_recording("path", file)
     path, frame = plan.path, planner.costs.ground.frame or "map"
-    known = path.known if path.known.any() else np.ones_like(path.known)
-    z = np.interp(path.distance, path.distance[known], np.where(path.known, path.z, 0)[known])
+    z = np.where(path.known, path.z, 0)
+    if path.known.any():
+        between = np.interp(path.distance, path.distance[path.known], path.z[path.known])
+        z = np.where(path.known, path.z, between)
     store = typestore({})
     stamped = store.types["geometry_msgs/msg/PoseStamped"]
     poses = [
@@ -158,7 +160,7 @@ def _why_not_on_earth(plan: Plan, ground: Site) -> str | None:
 
 
 def _positions(plan: Plan, ground: Site) -> tuple[list[list[float]], list[list[float]]]:
-    """Returns the longitude, latitude and, where it is known, height of a path's places, and of its points."""
+    """Returns where on earth a path leads, place by place, and where its points are."""
     reason = _why_not_on_earth(plan, ground)
     if reason is not None:
         raise InputError(f"site: {reason}: must be a coordinate system that says where on the earth it lies")
@@ -168,8 +170,10 @@ def _positions(plan: Plan, ground: Site) -> tuple[list[list[float]], list[list[f
     return _on_earth(path, moved.nonzero()[0], ground), _on_earth(path, np.array(nearest), ground)
 
 
-def _on_earth(path: Path, rows: np.ndarray, ground: Site) -> list[list[float]]:
-    longitude, latitude = from_earth(ground.crs).transform(*path.pose[rows, :2].T, direction="INVERSE", errcheck=True)
+def _on_earth(path: Path, rows: Int[np.ndarray, " r"], ground: Site) -> list[list[float]]:
+    """Returns the longitude, latitude and, where it is known, height of some poses."""
+    x, y, _ = path.pose[rows].T
+    longitude, latitude = from_earth(ground.crs).transform(x, y, direction="INVERSE", errcheck=True)
     at = np.stack([np.round(longitude, 9), np.round(latitude, 9), np.round(path.z[rows], 4)], axis=1).tolist()
     return [position if math.isfinite(position[2]) else position[:2] for position in at]
 

@@ -94,8 +94,9 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
 
 def _require_spacing(spacing: float, setup: SiteSetup) -> None:
     """Raises InputError unless nodes can be so far apart; setup: of the robot that stands still."""
-    most = (WIDEST // 2 - setup.grid.cells // 2) * setup.spacing / math.sqrt(2)
-    allowed = f"a whole number of strides, {setup.stride:g} m each, of at most {most:.3g} m"
+    diagonal = (WIDEST // 2 - setup.grid.cells // 2) * setup.spacing
+    most = math.floor(diagonal / math.sqrt(2) / setup.stride) * setup.stride
+    allowed = f"a whole number of strides, {setup.stride:g} m each, of at most {most:g} m"
     require_number("route graph, spacing", spacing, 0, most, allowed)
     strides = spacing / setup.stride
     require(round(strides) >= 1 and abs(strides - round(strides)) < 1e-6, "route graph, spacing", spacing, allowed)

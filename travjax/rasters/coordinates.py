@@ -7,10 +7,10 @@ pyproj brings its own database, so what a system says does not depend on the PRO
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from pyproj import CRS, Proj, Transformer
-from pyproj.aoi import AreaOfUse
 from pyproj.exceptions import CRSError, ProjError
 
 from travjax.config import InputError
@@ -246,7 +246,7 @@ def _from_own_origin(crs: CRS, x: float, y: float, longitude: float, latitude: f
     return not (within and area.south <= latitude <= area.north)
 
 
-def _area_of_use(crs: CRS) -> AreaOfUse | None:
-    """Returns where a system is meant to be used; None where that is not known."""
+def _area_of_use(crs: CRS) -> Any:
+    """Returns where a system is meant to be used, as pyproj says it; None where that is not known."""
     code = crs.to_authority(min_confidence=70)
     return crs.area_of_use or (_parsed(":".join(code)).area_of_use if code else None)
