@@ -38,7 +38,7 @@ GPX = {
 """Attributes of a GPX file."""
 
 
-def save_plan(folder: str | FilePath, plan: Plan, planner: Planner) -> tuple[list[FilePath], list[str]]:
+def save_path(folder: str | FilePath, plan: Plan, planner: Planner) -> tuple[list[FilePath], list[str]]:
     """Writes path.csv, path.geojson and path.gpx into a folder, which is made if need be.
 
     planner: that found the plan

@@ -16,7 +16,8 @@ from jaxtyping import Float, Int
 from travjax.config import require, require_number
 from travjax.files import atomic_write
 from travjax.jax_flags import usual_flags
-from travjax.planning.path_files import feature
+from travjax.plan_results.path_files import feature
+from travjax.planning.judges import MarginJudge
 from travjax.planning.planner import Planner
 from travjax.site.kernel import WIDEST, SiteSetup, site_margins
 from travjax.site.primitives import Primitive
@@ -66,7 +67,7 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
     Raises InputError where the robot's motions have no point turns or no straight drives, for other spacings, and where
     the robot cannot drive from any node to another.
     """
-    lattice, setup, costs = planner.lattice, planner.setup, planner.costs
+    lattice, setup, ground = planner.lattice, planner.setup, planner.costs.ground
     motions = lattice.motions
     require(motions.point_turns, "point_turns", motions.point_turns, "true for a route graph, at whose nodes one turns")
     require(lattice.headings > 1, "headings", lattice.headings, "2 or more for a route graph, at whose nodes one turns")
@@ -77,19 +78,18 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
     angles = [math.tau * number / len(DIRECTIONS) for number in range(len(DIRECTIONS))]
     lengths = [spacing * math.hypot(*direction) for direction in DIRECTIONS]
     drives = tuple(Primitive(angle, ((math.inf, length),)) for angle, length in zip(angles, lengths, strict=True))
-    margins = site_margins(costs.ground, replace(nodes, primitives=drives))
-    cost = costs.judged(margins, turning=False)[0] * np.array(lengths)[:, None, None]
+    judge = MarginJudge(ground, setup, lattice, planner.unknown_cost)  # whatever that of the planner is
+    ahead, _ = judge.judged(site_margins(ground, replace(nodes, primitives=drives)), turning=False)
     turns = replace(nodes, primitives=tuple(turn.primitive for turn in lattice.turns))
-    factor, _ = costs.judged(site_margins(costs.ground, turns), turning=True)
-    place = np.full(factor.shape[1:], -1)  # number of the node there
-    rows, cols = np.isfinite(factor).all(axis=0).nonzero()
+    around, _ = judge.judged(site_margins(ground, turns), turning=True)
+    place = np.full(around.shape[1:], -1)  # number of the node there
+    rows, cols = np.nonzero(np.isfinite(around).all(axis=0))
     place[rows, cols] = np.arange(len(rows))
-    edges, costs_of_edges = _edges(place, cost)
+    edges, cost = _edges(place, ahead * np.array(lengths)[:, None, None])
     allowed = "such that a straight drive leads from some place where the robot can turn to another; it can turn at"
     require(len(edges) > 0, "route graph, spacing", spacing, f"{allowed} {len(rows)} of {place.size} places")
-    origin = np.array(costs.ground.origin)
-    at = origin + spacing * np.stack([cols, rows], axis=1)
-    return RouteGraph(at, costs.ground.frame or "map", edges, costs_of_edges)
+    at = np.array(ground.origin) + spacing * np.stack([cols, rows], axis=1)
+    return RouteGraph(at, ground.frame or "map", edges, cost)
 
 
 def _require_spacing(spacing: float, setup: SiteSetup) -> None:

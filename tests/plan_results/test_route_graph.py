@@ -11,9 +11,9 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from travjax.config import InputError
+from travjax.plan_results.route_graph import RouteGraph, route_graph, save_route_graph
 from travjax.planning.motions import Motions
 from travjax.planning.planner import Planner
-from travjax.planning.route_graph import RouteGraph, route_graph, save_route_graph
 from travjax.simulation.setup import chosen_robot
 from travjax.site.ground import ArrayGround
 from travjax.site.kernel import site_margins

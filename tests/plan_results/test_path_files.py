@@ -14,10 +14,10 @@ import pytest
 from pyproj import Transformer
 
 from travjax.config import InputError
+from travjax.plan_results.path_files import COLUMNS, save_csv, save_geojson, save_gpx, save_path, save_ros_path
 from travjax.planning.endpoints import endpoint
 from travjax.planning.motions import Motions
 from travjax.planning.path import Leg, drive
-from travjax.planning.path_files import COLUMNS, save_csv, save_geojson, save_gpx, save_plan, save_ros_path
 from travjax.planning.planner import Plan, Planner
 from travjax.site.ground import ArrayGround
 
@@ -214,7 +214,7 @@ def test_a_path_of_one_place_is_a_line_nevertheless(tmp_path):
 def test_sites_that_do_not_lie_on_earth_get_a_table_and_a_reason(tmp_path, crs, origin, reason):
     plan, planner = driven(ground_of(crs, origin))
     (tmp_path / "path.gpx").write_text("of an earlier plan")
-    files, lines = save_plan(tmp_path, plan, planner)
+    files, lines = save_path(tmp_path, plan, planner)
     assert files == [tmp_path / "path.csv"] and sorted(tmp_path.iterdir()) == files
     assert lines == [f"path.geojson and path.gpx: not written: {reason}"]
     for save in (save_geojson, save_gpx):
@@ -226,7 +226,7 @@ def test_sites_that_do_not_lie_on_earth_get_a_table_and_a_reason(tmp_path, crs, 
 
 def test_a_projection_around_the_site_lies_on_earth(tmp_path):
     plan, planner = driven(ground_of("+proj=tmerc +lat_0=47 +lon_0=9 +datum=WGS84 +units=m", (0.0, 0.0)))
-    _, lines = save_plan(tmp_path, plan, planner)
+    _, lines = save_path(tmp_path, plan, planner)
     position = json.loads((tmp_path / "path.geojson").read_text())["features"][1]["geometry"]["coordinates"]
     assert not lines and position[:2] == pytest.approx([9, 47], abs=1e-4)
 
@@ -283,7 +283,7 @@ def test_a_plan_is_written_into_a_new_folder(tmp_path):
     planner = Planner(ground_of(), motions=Motions(turns=(0,)), headings=8, contact="nearest")
     east, north = ORIGIN
     plan = planner.plan((east + 2, north + 2), (east + 4.5, north + 3.5, -math.pi / 2))
-    files, lines = save_plan(tmp_path / "new", plan, planner)
+    files, lines = save_path(tmp_path / "new", plan, planner)
     assert [file.name for file in files] == ["path.csv", "path.geojson", "path.gpx"] and not lines
     assert sorted((tmp_path / "new").iterdir()) == files
     first, *_, last = rows_of(files[0])
