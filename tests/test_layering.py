@@ -13,7 +13,7 @@ LAYERS = {
     "simulation": "arrays grid heights events contact physics_table robot actions footprint tyre_tables setup",
     "traversal": "arcs nearest steps tyre tyre_trajectories traverse reference tyre_reference pose_by_pose",
     "terrain": "noise landforms rock_field styles",
-    "rasters": "coordinates reading_options formats raster gdal_files grid_maps array_files holes surface",
+    "rasters": "coordinates reading_options formats raster gdal_files recordings grid_maps array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
     "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
@@ -24,7 +24,7 @@ LAYERS = {
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "planning": "biarcs motions path judges costs endpoints search no_path planner to_go field_judge action_space",
-    "plan_results": "plan_figures plan_report plan_benchmark",
+    "plan_results": "path_files route_graph plan_figures plan_report plan_benchmark",
     "training": "step trainer fit evaluation_report network_benchmark",
     "physics": "model drive labelling agreement check report",
     "programs": "entry options",

@@ -1,5 +1,7 @@
 """Coordinate systems: a metre of theirs must be one on the ground."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from travjax.rasters.coordinates import (
     require_metric,
     require_metric_named,
     short_name,
+    why_not_on_earth,
 )
 
 
@@ -141,3 +144,22 @@ def test_places_on_another_planet_are_not_those_on_earth():
     radius, xyz = places(MARS.format(0), np.zeros(1), np.zeros(1))
     assert radius == 3_396_190
     np.testing.assert_allclose(xyz, [[3_396_190, 0, 0]], atol=1)
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y", "reason"),
+    [
+        ("EPSG:32632", 500_000, 5_200_000, None),
+        ("EPSG:25832+7837", 500_000, 5_200_000, None),
+        ("+proj=tmerc +lat_0=47 +lon_0=9 +datum=WGS84 +units=m", 3, 5, None),
+        ("EPSG:32632", 3, 5, "crs = EPSG:32632: x, y = 3, 5: count from an origin of the site's own"),
+        (None, 3, 5, "no coordinate system says where on earth the site lies"),
+        (LOCAL, 3, 5, "no coordinate system says where on earth the site lies"),
+        (UNNAMED, 3, 5, "no coordinate system says where on earth the site lies"),
+        ("IAU_2015:49910", 3, 5, "crs = IAU_2015:49910: lies on another body than the earth"),
+        ("EPSG:32632", 1e12, 5, r"crs = EPSG:32632: x, y = 1e\+12, 5: .+"),
+    ],
+)
+def test_a_point_lies_on_earth_or_a_line_says_why_not(system, x, y, reason):
+    found = why_not_on_earth(system, x, y)
+    assert found is None if reason is None else re.fullmatch(reason, found or "")

@@ -10,9 +10,9 @@ import pytest
 from tests.commandline import run_words
 from travjax.config import InputError
 from travjax.data.dem import load_dem
-from travjax.rasters import grid_maps
-from travjax.rasters.grid_maps import DEFINITIONS, TYPE, read_grid_map, rosbags, write_grid_map
+from travjax.rasters.grid_maps import DEFINITIONS, TYPE, grid_map_types, read_grid_map, write_grid_map
 from travjax.rasters.reading_options import DemOptions
+from travjax.rasters.recordings import rosbags
 from travjax.simulation.grid import Grid
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
@@ -31,7 +31,7 @@ def heights() -> np.ndarray:
 def recorded(path: Path, maps, *, topic="/grid_map", shift=(0, 0), turn=0.0, ros1=False, definitions=True) -> Path:
     """Writes messages, one a second; each is layers by name, laid out node by node as grid_map's sources say."""
     engine = rosbags()
-    store = grid_maps.typestore()
+    store = grid_map_types()
     if ros1:
         types = engine.typesys
         store = types.get_typestore(types.Stores.ROS1_NOETIC)

@@ -65,20 +65,21 @@ class MarginJudge:
         parts = []
         for setup in self._setups:
             margins = tile_margins(self._ground.part(*tile.ground(setup)), setup)
-            parts.append(self._judged(margins, isinstance(setup.primitives[0], PointTurn)))
+            parts.append(self.judged(margins, isinstance(setup.primitives[0], PointTurn)))
         factors, in_the_way = (np.concatenate(field) for field in zip(*parts, strict=True))
         return factors, in_the_way
 
     def standing(self) -> Judged:
         """Judges the robot standing at every place in every heading."""
-        return self._judged(site_margins(self._ground, self._standing), turning=True)
+        return self.judged(site_margins(self._ground, self._standing), turning=True)
 
-    def _judged(self, margins: Margins, turning: bool) -> Judged:
+    def judged(self, margins: Margins, turning: bool) -> Judged:
+        """Judges the margins of some motions; turning: whether they are point turns, whose wheels do not climb."""
         known = np.asarray(margins.known)
         share, in_the_way = np.zeros(known.shape, np.float32), np.zeros(known.shape, np.uint8)
         for number, (event, limit) in enumerate(zip(self._robot.events, self._robot.limits, strict=True), 1):
             if turning and event.name == "step":
-                continue  # wheels that turn on the spot do not climb
+                continue
             ours = np.asarray(margins[event.name]) / np.float32(limit)
             over = np.asarray(margins[event.name]) > np.float32(limit)  # a quotient may be rounded to 1
             in_the_way[over & (ours >= np.maximum(share, 1))] = number

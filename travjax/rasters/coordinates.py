@@ -7,6 +7,7 @@ pyproj brings its own database, so what a system says does not depend on the PRO
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from pyproj import CRS, Proj, Transformer
@@ -139,14 +140,34 @@ def places(name: str, x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
     name: of a system that is not local
     """
     crs = horizontal(parsed(name))
-    radius = crs.ellipsoid.semi_major_metre if crs.ellipsoid else EARTH
-    if abs(radius / EARTH - 1) < 0.01:
+    radius = _radius(crs)
+    if _like_earth(radius):
         to_centre = Transformer.from_crs(crs, "EPSG:4978", always_xy=True)
         return EARTH, np.stack(to_centre.transform(x, y, np.zeros_like(x)), axis=-1)
     longitude, latitude = np.radians(Proj(crs)(x, y, inverse=True))
     level = np.cos(latitude)
     unit = np.stack([level * np.cos(longitude), level * np.sin(longitude), np.sin(latitude)], axis=-1)
     return float(round(radius)), radius * unit
+
+
+def why_not_on_earth(name: str | None, x: float, y: float) -> str | None:
+    """Says why a point of a system has no known longitude and latitude on the earth; None where it has them.
+
+    name: of a system that `system_named` understands, or None; x, y: metres
+    """
+    crs = system_named(name)
+    if crs is None or "Engineering" in horizontal(crs).type_name:
+        return "no coordinate system says where on earth the site lies"
+    ground, named = horizontal(crs), f"crs = {short_name(crs)}"
+    if not _like_earth(_radius(ground)):
+        return f"{named}: lies on another body than the earth"
+    try:
+        longitude, latitude = Proj(ground)(x, y, inverse=True, errcheck=True)
+    except ProjError as error:
+        return f"{named}: x, y = {x:g}, {y:g}: {error}"
+    if _area_of_use(ground) and _from_own_origin(ground, x, y, longitude, latitude):
+        return f"{named}: x, y = {x:g}, {y:g}: count from an origin of the site's own"
+    return None
 
 
 def require_height_unit(where: str, unit: str, metres: float, heights_scaled: bool) -> None:
@@ -175,6 +196,15 @@ def short_name(crs: CRS) -> str:
     """Returns the code of a system, else its own name."""
     authority = horizontal(crs).to_authority(min_confidence=70)
     return ":".join(authority) if authority else f'"{horizontal(crs).name}"'
+
+
+def _radius(crs: CRS) -> float:
+    """Returns the metres from the centre of a system's planet to its equator."""
+    return crs.ellipsoid.semi_major_metre if crs.ellipsoid else EARTH
+
+
+def _like_earth(radius: float) -> bool:
+    return abs(radius / EARTH - 1) < 0.01
 
 
 def _height_axes(crs: CRS) -> Sequence:
@@ -209,9 +239,14 @@ def _from_own_origin(crs: CRS, x: float, y: float, longitude: float, latitude: f
     """
     if max(abs(x), abs(y)) > NEAR_ORIGIN:
         return False
-    code = crs.to_authority(min_confidence=70)
-    area = crs.area_of_use or (code and _parsed(":".join(code)).area_of_use)
-    if not area:
+    area = _area_of_use(crs)
+    if area is None:
         return True
     within = area.west <= longitude <= area.east if area.west <= area.east else not area.east < longitude < area.west
     return not (within and area.south <= latitude <= area.north)
+
+
+def _area_of_use(crs: CRS) -> Any:
+    """Returns where a system is meant to be used, as pyproj says it; None where that is not known."""
+    code = crs.to_authority(min_confidence=70)
+    return crs.area_of_use or (_parsed(":".join(code)).area_of_use if code else None)

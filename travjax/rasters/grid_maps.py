@@ -7,14 +7,14 @@ circular buffers. Here, row 0 is the southernmost and column 0 the westernmost.
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from travjax.config import InputError, require, require_installed
+from travjax.config import InputError, require
 from travjax.rasters.raster import InMetres, Raster, agreed_cell_size
 from travjax.rasters.reading_options import DemOptions
+from travjax.rasters.recordings import header, pose, rosbags, typestore, write_message
 
 TYPE = "grid_map_msgs/msg/GridMap"
 
@@ -42,23 +42,9 @@ TURNED = 1e-3
 """Radians, the largest angle of a map's pose that counts as none."""
 
 
-def rosbags() -> ModuleType:
-    """Returns the package rosbags; raises InputError that says how to install it where it is missing."""
-    require_installed("rosbags", "rosbags", "ros")
-    import rosbags.highlevel
-    import rosbags.rosbag2
-    import rosbags.typesys
-
-    return rosbags
-
-
-def typestore() -> Any:
+def grid_map_types() -> Any:
     """Returns the message types of ROS 2, and those of grid_map."""
-    types = rosbags().typesys
-    store = types.get_typestore(types.Stores.ROS2_HUMBLE)
-    for name, text in DEFINITIONS.items():
-        store.register(types.get_types_from_msg(text, name))
-    return store
+    return typestore(DEFINITIONS)
 
 
 def read_grid_map(path: Path, options: DemOptions) -> Raster:
@@ -69,7 +55,7 @@ def read_grid_map(path: Path, options: DemOptions) -> Raster:
     """
     engine = rosbags()
     try:
-        with engine.highlevel.AnyReader([path], default_typestore=typestore()) as reader:
+        with engine.highlevel.AnyReader([path], default_typestore=grid_map_types()) as reader:
             message = _message(reader, options)
             return _raster(message, options)
     except InputError:
@@ -144,18 +130,12 @@ def write_grid_map(
 
     origin: x, y of the south-west cell's middle, metres
     """
-    engine, types = rosbags(), typestore()
-    kinds, plugins = types.types, engine.rosbag2.StoragePlugin
+    store = grid_map_types()
+    kinds = store.types
     rows, cols = next(iter(layers.values())).shape
-    stamp = kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
-    header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id=frame)
     x, y = origin[0] + (cols - 1) / 2 * cell_size, origin[1] + (rows - 1) / 2 * cell_size
-    pose = kinds["geometry_msgs/msg/Pose"](
-        position=kinds["geometry_msgs/msg/Point"](x=x, y=y, z=0.0),
-        orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-    )
     info = kinds["grid_map_msgs/msg/GridMapInfo"](
-        resolution=cell_size, length_x=cols * cell_size, length_y=rows * cell_size, pose=pose
+        resolution=cell_size, length_x=cols * cell_size, length_y=rows * cell_size, pose=pose(store, x, y)
     )
     dimension = kinds["std_msgs/msg/MultiArrayDimension"]
     dims = [dimension("column_index", rows, rows * cols), dimension("row_index", cols, cols)]
@@ -164,10 +144,5 @@ def write_grid_map(
         kinds["std_msgs/msg/Float32MultiArray"](layout, np.ascontiguousarray(layer[::-1, ::-1], np.float32).ravel())
         for layer in layers.values()
     ]
-    message = kinds[TYPE](header, info, list(layers), [], data, 0, 0)
-    folder = path.with_name(f"{path.name}.bag")
-    plugin = plugins.SQLITE3 if path.suffix == ".db3" else plugins.MCAP
-    with engine.rosbag2.Writer(folder, version=9, storage_plugin=plugin) as writer:
-        connection = writer.add_connection("/grid_map", TYPE, typestore=types)
-        writer.write(connection, 0, types.serialize_cdr(message, TYPE))
-    next(file for file in folder.iterdir() if file.suffix == path.suffix).rename(path)
+    message = kinds[TYPE](header(store, frame), info, list(layers), [], data, 0, 0)
+    write_message(path, "/grid_map", TYPE, message, store)

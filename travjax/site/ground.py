@@ -33,7 +33,7 @@ class Ground(Protocol):
 class ArrayGround:
     """A site in memory: heights [rows, cols], float32 metres above `height_offset`, NaN where unknown.
 
-    spacing, origin, crs: as of SiteGround
+    spacing, origin, crs, frame: as of SiteGround
     """
 
     heights: Float[np.ndarray, "rows cols"]
@@ -41,6 +41,7 @@ class ArrayGround:
     spacing: float = 0.0625
     origin: tuple[float, float] = (0.0, 0.0)
     crs: str | None = None
+    frame: str | None = None
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -16,8 +16,9 @@ from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import atomic_write, held, output_folder, resolved, save_text
 from travjax.memory import require_memory
-from travjax.rasters.grid_maps import rosbags, write_grid_map
+from travjax.rasters.grid_maps import write_grid_map
 from travjax.rasters.raster import COARSEST
+from travjax.rasters.recordings import require_recording
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.site import site_figures
@@ -140,9 +141,7 @@ def save_map(
     """
     rasterio()
     if grid_map is not None:
-        rosbags()
-        fits = grid_map.suffix in (".mcap", ".db3") and grid_map.parent.is_dir() and not grid_map.is_dir()
-        require(fits, "--grid-map", str(grid_map), "a file in a folder that exists, its name ending in .mcap or .db3")
+        require_recording("--grid-map", grid_map)
     rasters = [Path(out) / name for name in ("map.tif", "headings.tif", "blocking.tif")]
     require_not_written(site, [*rasters, *([grid_map] if grid_map else [])])
     with executor(scheduler) as pool, held(folder := output_folder(out)):
