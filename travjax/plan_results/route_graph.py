@@ -63,7 +63,7 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
     """Returns the route graph of a planner's site, by exact margins of the site kernel.
 
     spacing: metres between nodes, a whole number of strides; about 2 unless given
-    Unknown ground is driven on only if the planner's unknown_cost says so.
+    Unknown ground is driven on only if the planner has an unknown_cost.
     Raises InputError where the robot's motions have no point turns or no straight drives, for other spacings, and where
     the robot cannot drive from any node to another.
     """
