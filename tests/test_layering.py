@@ -25,11 +25,12 @@ LAYERS = {
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
     "planning": "biarcs motions path judges costs endpoints search no_path planner to_go field_judge action_space",
     "plan_results": "path_files route_graph plan_figures plan_report plan_benchmark",
+    "navigation": "tasks methods trials scores",
     "training": "step trainer fit evaluation_report network_benchmark",
     "physics": "model drive labelling agreement check report",
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
-    "timing comparison physics",
+    "timing comparison physics navigation",
     "commands": "terrain label map plan dataset weights train evaluate export predict physics bench",
     "program": "cli",
 }

@@ -78,6 +78,16 @@ def add(commands: options.Commands) -> None:
         action="store_true",
         help="also write the cost to go to the goal from everywhere",
     )
+    parser.add_argument(
+        "--route-graph",
+        type=user_path,
+        metavar="FILE",
+        help="also write a route graph for Nav2, .geojson: places 2 m apart where the robot can turn on the spot, and "
+        "straight drives between them",
+    )
+    parser.add_argument(
+        "--ros-path", type=user_path, metavar="FILE", help="also write the path as nav_msgs/Path, .mcap or .db3"
+    )
     options.add_reading(parser)
     options.add_out(parser, "runs/plan")
     parser.set_defaults(run=run)
@@ -86,11 +96,13 @@ def add(commands: options.Commands) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Plans the path and writes the results; returns the exit code."""
     from travjax.plan_results.plan_report import save_no_path, save_plan, save_to_go
+    from travjax.plan_results.route_graph import route_graph, save_route_graph
     from travjax.planning.field_judge import FieldJudge
     from travjax.planning.motions import Motions
     from travjax.planning.no_path import NoPathError
     from travjax.planning.planner import Planner
     from travjax.planning.to_go import CostToGo
+    from travjax.rasters.recordings import require_recording
     from travjax.runs.predictor import Predictor
     from travjax.simulation.contact import spacing_note
     from travjax.site.ground import SiteGround
@@ -99,7 +111,10 @@ def run(arguments: argparse.Namespace) -> int:
     goal, via = _point("--to", arguments.goal), [_point("--via", point) for point in arguments.via]
     require(arguments.start or arguments.to_go, "--from", None, "given, unless --to-go is")
     start = _point("--from", arguments.start) if arguments.start else None
-    require(start is not None or not via, "--via", arguments.via, "left out where --from is")
+    for option, given in (("--via", via), ("--ros-path", arguments.ros_path)):
+        require(start is not None or not given, option, given, "left out where --from is")
+    if arguments.ros_path:
+        require_recording("--ros-path", arguments.ros_path)
     motions = Motions.load(arguments.primitives) if arguments.primitives else None
     site = SiteGround.open(
         arguments.site,
@@ -129,11 +144,17 @@ def run(arguments: argparse.Namespace) -> int:
     for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
         if line:
             progress.say(f"{arguments.site}: {line}")
+    if arguments.route_graph:
+        graph = route_graph(planner)
+        for note in graph.notes:
+            progress.say(note)
+        progress.wrote(save_route_graph(arguments.route_graph, graph))
     try:
         if arguments.to_go:
             save_to_go(CostToGo(planner, goal, arguments.coordinates), arguments.out)
         if start is not None:
-            save_plan(planner.plan(start, goal, via, arguments.coordinates), planner, arguments.out)
+            plan = planner.plan(start, goal, via, arguments.coordinates)
+            save_plan(plan, planner, arguments.out, arguments.ros_path)
     except NoPathError as error:
         save_no_path(error, planner, arguments.out)
         return NO_PATH

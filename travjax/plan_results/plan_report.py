@@ -9,6 +9,7 @@ from travjax.config import one_line
 from travjax.evaluation import map_figures
 from travjax.evaluation.tables import rows_table
 from travjax.files import held, output_folder, save_text
+from travjax.plan_results import path_files
 from travjax.plan_results.plan_figures import no_path_figure, plan_figure, to_go_figure
 from travjax.planning.no_path import NoPathError
 from travjax.planning.planner import Plan, Planner
@@ -17,8 +18,12 @@ from travjax.simulation.events import EVENTS
 from travjax.site.geotiff import Frame, save_geotiff
 
 
-def save_plan(plan: Plan, planner: Planner, out: str | FilePath) -> FilePath:
-    """Writes path.csv, plan.png and plan.txt, prints what the plan is, and returns the folder."""
+def save_plan(plan: Plan, planner: Planner, out: str | FilePath, ros_path: FilePath | None = None) -> FilePath:
+    """Writes a plan's files and figure into a folder, prints what the plan is, and returns the folder.
+
+    ros_path: file, .mcap or .db3, that gets the path as nav_msgs/Path as well
+    Raises InputError when something cannot be written.
+    """
     path, robot = plan.path, planner.setup.robot
     limits = dict(zip(robot.event_names, robot.limits, strict=True))
     largest = {name: float(np.nanmax(getattr(path, name), initial=0)) for name in EVENTS}
@@ -31,10 +36,13 @@ def save_plan(plan: Plan, planner: Planner, out: str | FilePath) -> FilePath:
     progress.say("\n".join(lines))
     with held(folder := output_folder(out)):
         figure = plan_figure(plan, planner, (lines[0], lines[1]))
-        written = [
-            map_figures.save(figure, folder / "plan.png"),
-            save_text(folder / "plan.txt", "\n".join(lines) + "\n"),
-        ]
+        written, notes = path_files.save_path(folder, plan, planner)
+        written.append(map_figures.save(figure, folder / "plan.png"))
+        written.append(save_text(folder / "plan.txt", "\n".join(lines) + "\n"))
+        if ros_path is not None:
+            written.append(path_files.save_ros_path(ros_path, plan, planner))
+    for note in notes:
+        progress.say(note)
     progress.wrote(*written)
     return folder
 

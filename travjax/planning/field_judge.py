@@ -4,6 +4,7 @@ The field reads a window around a tile of places once. A motion's probability is
 its logit is the log-sum-exp of those of its poses.
 """
 
+import copy
 import math
 from functools import partial
 
@@ -43,10 +44,17 @@ class FieldJudge:
     final = False  # a map may be noisy, and the sequential simulators take noise for ground
 
     def __init__(
-        self, ground: Site, setup: SiteSetup, lattice: MotionLattice, predictor: Predictor, threshold: float = 0.5
+        self,
+        ground: Site,
+        setup: SiteSetup,
+        lattice: MotionLattice,
+        predictor: Predictor,
+        threshold: float = 0.5,
+        keep: bool = False,
     ):
         """
         setup: robot, spacing, stride and contact model, which must be those that the predictor was trained for
+        keep:  whether to keep what the field says of each tile, for judges made by `weighing`
         Raises InputError where they are others, and for an estimator that is not a hazard field.
         """
         run = predictor.run
@@ -55,7 +63,9 @@ class FieldJudge:
         trained = run.grid.spacing
         require(abs(setup.spacing / trained - 1) < 1e-6, "spacing", setup.spacing, f"{trained:g} m, as in training")
         require(0 < threshold < 1, "threshold", threshold, "a probability above 0 and below 1")
-        self._ground, self._setup, self._lattice, self._threshold = ground, setup, lattice, threshold
+        self._ground, self._setup, self._threshold = ground, setup, threshold
+        self._risk = lattice.motions.risk
+        self._kept: dict[Tile, tuple[np.ndarray, np.ndarray]] | None = {} if keep else None
         self._known = MarginJudge(ground, setup, lattice)
         self._graph, self._variables = split_model(predictor.network)
         self._scale = np.float32(run.preset.elevation_scale)
@@ -72,9 +82,28 @@ class FieldJudge:
         self._offsets = np.stack([row - half, col - half])
         self._halo = half + math.ceil(AROUND / setup.spacing)
 
-    @usual_flags()
+    def weighing(self, risk: float) -> "FieldJudge":
+        """Returns a judge for which the probability has another weight in the cost."""
+        other = copy.copy(self)
+        other._risk = risk
+        return other
+
     def motions(self, tile: Tile) -> Judged:
         """Judges the motions from the places of a tile."""
+        if self._kept is None:
+            largest, worst = self._probabilities(tile)
+        else:
+            if tile not in self._kept:
+                self._kept[tile] = self._probabilities(tile)
+            largest, worst = self._kept[tile]
+        unknown = self._known.motions(tile)[1] == UNKNOWN
+        in_the_way = np.where(unknown, UNKNOWN, np.where(largest > self._threshold, worst, 0)).astype(np.uint8)
+        factor = np.where(in_the_way > 0, np.inf, 1 + self._risk * largest**2)
+        return factor.astype(np.float32), in_the_way
+
+    @usual_flags()
+    def _probabilities(self, tile: Tile) -> tuple[np.ndarray, np.ndarray]:
+        """Returns the probability of the most probable event of each motion, and the number of that event."""
         step, halo = self._setup.step, self._halo
         count = tile.edge * step + 2 * halo
         south, west = tile.row * step - halo, tile.col * step - halo
@@ -87,11 +116,7 @@ class FieldJudge:
         network = self._graph, self._variables
         found = _probabilities(*network, (elevation - centre) / self._scale, offsets, self._real, first)
         probability = np.asarray(found).reshape(*found.shape[:2], tile.edge, tile.edge)
-        largest, worst = probability.max(axis=1), probability.argmax(axis=1) + 1
-        unknown = self._known.motions(tile)[1] == UNKNOWN
-        in_the_way = np.where(unknown, UNKNOWN, np.where(largest > self._threshold, worst, 0)).astype(np.uint8)
-        factor = np.where(in_the_way > 0, np.inf, 1 + self._lattice.motions.risk * largest**2)
-        return factor.astype(np.float32), in_the_way
+        return probability.max(axis=1), probability.argmax(axis=1) + 1
 
     def standing(self) -> Judged:
         """Judges that the robot can stand on all ground that is known: the field knows drives."""

@@ -1,0 +1,109 @@
+"""How often each method arrived, with intervals, as tables and as a figure."""
+
+import math
+from collections.abc import Sequence
+from itertools import cycle
+from statistics import NormalDist
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from travjax.evaluation.tables import rows_table
+from travjax.navigation.methods import METHODS
+from travjax.navigation.trials import ARRIVED, FAILED, REFUSED, Trial
+
+CONFIDENCE = 0.95
+
+COLOURS = ("#999999", "#0072b2", "#56b4e9", "#003a5c", "#e69f00", "#d55e00")
+"""Of METHODS; markers tell them apart without colour."""
+
+MARKERS = "sovD^P"
+
+
+def interval(count: int, total: int) -> tuple[float, float]:
+    """Returns the interval of confidence of a share; source: Wilson 1927."""
+    if total == 0:
+        return 0.0, 1.0
+    z = NormalDist().inv_cdf((1 + CONFIDENCE) / 2)
+    share, centre = count / total, count / total + z**2 / (2 * total)
+    half = z * math.sqrt(share * (1 - share) / total + z**2 / (4 * total**2))
+    return max(0.0, (centre - half) / (1 + z**2 / total)), min(1.0, (centre + half) / (1 + z**2 / total))
+
+
+def table(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str:
+    """Returns a table of one kind of ground: a row for each corruption and method."""
+    rows = []
+    for corruption in corruptions:
+        for method in METHODS:
+            mine = [one for one in trials if (one.kind, one.corruption, one.method) == (kind, corruption, method)]
+            if not mine:
+                continue
+            counts = {end: sum(one.ended == end for one in mine) for end in (ARRIVED, FAILED, REFUSED)}
+            low, high = interval(counts[ARRIVED], len(mine))
+            detours = [one.detour for one in mine if one.ended == ARRIVED]
+            rows.append(
+                {
+                    "map": corruption,
+                    "method": method,
+                    "tasks": len(mine),
+                    "arrived": f"{counts[ARRIVED] / len(mine):.1%}",
+                    "95 %": f"{low:.0%} to {high:.0%}",
+                    "failed on the way": f"{counts[FAILED] / len(mine):.1%}",
+                    "no path": f"{counts[REFUSED] / len(mine):.1%}",
+                    "length": f"{np.mean(detours):.3f}" if detours else "-",
+                }
+            )
+    return rows_table(rows)
+
+
+def winners(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str:
+    """Says for each corruption which methods arrived most often, and which are not told apart from them."""
+    lines = []
+    for corruption in corruptions:
+        shares = {}
+        for method in METHODS:
+            mine = [one for one in trials if (one.kind, one.corruption, one.method) == (kind, corruption, method)]
+            if mine:
+                shares[method] = (sum(one.ended == ARRIVED for one in mine), len(mine))
+        best = max(shares, key=lambda method: shares[method][0] / shares[method][1])
+        least = interval(*shares[best])[0]
+        close = [name for name in shares if name != best and interval(*shares[name])[1] >= least]
+        beside = f"; its interval overlaps with those of {', '.join(close)}" if close else ""
+        lines.append(f"- {corruption}: {best}, {shares[best][0] / shares[best][1]:.1%}{beside}")
+    return "\n".join(lines)
+
+
+def figure(trials: Sequence[Trial], corruptions: Sequence[str]) -> Figure:
+    """Draws the share of tasks that arrived and that failed on the way, by corruption, a column a kind of ground."""
+    kinds = list(dict.fromkeys(one.kind for one in trials))
+    drawn = Figure(figsize=(3.2 + 4.3 * len(kinds), 7.2), layout="constrained")
+    axes = np.atleast_2d(drawn.subplots(2, len(kinds), sharey="row", squeeze=False))
+    for column, kind in enumerate(kinds):
+        for row, (end, title) in enumerate(((ARRIVED, "arrived"), (FAILED, "failed on the way"))):
+            ax = axes[row, column]
+            _draw(ax, [one for one in trials if one.kind == kind], corruptions, end)
+            tasks = len({(one.ground, one.task) for one in trials if one.kind == kind})
+            ax.set_title(f"{kind}, {tasks} tasks" if row == 0 else "")
+            ax.set_ylabel(f"share that {title}" if column == 0 else "")
+            ax.set_xticks(range(len(corruptions)), corruptions, rotation=30, ha="right", fontsize=8)
+            ax.grid(alpha=0.3)
+    axes[0, 0].set_ylim(0, 1.02)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside right upper", fontsize=8, title="95 % intervals")
+    return drawn
+
+
+def _draw(ax, trials: Sequence[Trial], corruptions: Sequence[str], end: str) -> None:
+    """Draws the shares of one end of a task, a little apart from each other."""
+    for number, (method, colour, marker) in enumerate(zip(METHODS, cycle(COLOURS), cycle(MARKERS), strict=False)):
+        x, y, low, high = [], [], [], []
+        for place, corruption in enumerate(corruptions):
+            mine = [one.ended == end for one in trials if (one.corruption, one.method) == (corruption, method)]
+            if mine:
+                share, (least, most) = np.mean(mine), interval(sum(mine), len(mine))
+                x.append(place + 0.1 * (number - len(METHODS) / 2))
+                y.append(share)
+                low.append(share - least)
+                high.append(most - share)
+        bars = np.maximum([low, high], 0)
+        ax.errorbar(x, y, bars, color=colour, marker=marker, markersize=5, linewidth=1, capsize=2, label=method)
