@@ -11,6 +11,8 @@ from travjax.config import require
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 
+ACTION_SPACE = "action-space"
+
 NO_PATH = 1
 """Exit code where there is no path."""
 
@@ -68,6 +70,12 @@ def add(commands: options.Commands) -> None:
         "--interval", type=float, default=0.06, metavar="M", help="metres between simulated poses (0.06)"
     )
     parser.add_argument(
+        "--planner",
+        choices=("lattice", ACTION_SPACE),
+        default="lattice",
+        help="search on the lattice, or, as a baseline, by the paper's 3042 trajectories from each state (lattice)",
+    )
+    parser.add_argument(
         "--unknown-cost",
         type=float,
         metavar="K",
@@ -97,6 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Plans the path and writes the results; returns the exit code."""
     from travjax.plan_results.plan_report import save_no_path, save_plan, save_to_go
     from travjax.plan_results.route_graph import route_graph, save_route_graph
+    from travjax.planning.action_space import ActionSpacePlanner
     from travjax.planning.field_judge import FieldJudge
     from travjax.planning.motions import Motions
     from travjax.planning.no_path import NoPathError
@@ -113,6 +122,11 @@ def run(arguments: argparse.Namespace) -> int:
     start = _point("--from", arguments.start) if arguments.start else None
     for option, given in (("--via", via), ("--ros-path", arguments.ros_path)):
         require(start is not None or not given, option, given, "left out where --from is")
+    if arguments.planner == ACTION_SPACE:
+        unused = ("via", "to_go", "estimator", "unknown_cost", "primitives")
+        for name in unused:
+            given = getattr(arguments, name)
+            require(not given, f"--{name.replace('_', '-')}", str(given), f"left out with --planner {ACTION_SPACE}")
     if arguments.ros_path:
         require_recording("--ros-path", arguments.ros_path)
     motions = Motions.load(arguments.primitives) if arguments.primitives else None
@@ -153,7 +167,10 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.to_go:
             save_to_go(CostToGo(planner, goal, arguments.coordinates), arguments.out)
         if start is not None:
-            plan = planner.plan(start, goal, via, arguments.coordinates)
+            if arguments.planner == ACTION_SPACE:
+                plan = ActionSpacePlanner(planner).plan(start, goal, arguments.coordinates)
+            else:
+                plan = planner.plan(start, goal, via, arguments.coordinates)
             save_plan(plan, planner, arguments.out, arguments.ros_path)
     except NoPathError as error:
         save_no_path(error, planner, arguments.out)

@@ -108,3 +108,7 @@ def _write(trials: list[Trial], chosen: Mapping[str, str], config: NavigationCon
     filters = "\n".join(f"- {name}: {chosen[name]}" for name in config.corruptions)
     pieces += ["## Filters", filters]
     progress.wrote(drawn, out / DONE, launch.write_report(out, "Navigation", pieces))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
