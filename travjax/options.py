@@ -18,6 +18,7 @@ from travjax.terrain.styles import STYLES
 if TYPE_CHECKING:  # these take seconds to import
     from travjax.estimators.preset import Preset
     from travjax.runs.run import Run
+    from travjax.site.ground import SiteGround
 
 
 class Commands(Protocol):
@@ -188,6 +189,24 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_site(parser: argparse.ArgumentParser) -> None:
+    """Adds the file of a whole site, how it is read, the robot, and the lattice of places; see `site`."""
+    parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
+    add_robot_alone(parser)
+    add_contact_model(parser, "tyre")
+    parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
+    parser.add_argument(
+        "--stride",
+        type=float,
+        metavar="M",
+        help="metres between places (0.25, or as many coarse cells as make up that)",
+    )
+    parser.add_argument(
+        "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
+    )
+    add_reading(parser)
+
+
 def _codes(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(code) for code in text.split(","))
@@ -241,6 +260,19 @@ def reading(arguments: argparse.Namespace) -> DemOptions:
         arguments.topic,
         arguments.layer,
         arguments.time,
+    )
+
+
+def site(arguments: argparse.Namespace) -> "SiteGround":
+    """Opens the elevation map of a whole site."""
+    from travjax.site.ground import SiteGround
+
+    return SiteGround.open(
+        arguments.site,
+        arguments.spacing,
+        reading=reading(arguments),
+        fill_holes=not arguments.keep_holes,
+        allow_coarse=arguments.allow_coarse,
     )
 
 

@@ -2,12 +2,11 @@
 
 import argparse
 
-from travjax import options, progress
+from travjax import options
 from travjax.config import require
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 from travjax.signals import going_on
-from travjax.simulation.contact import spacing_note
 
 
 def add(commands: options.Commands) -> None:
@@ -19,26 +18,13 @@ def add(commands: options.Commands) -> None:
         "GeoTIFFs of its cost and of what blocks it, and maps for Nav2. A site is an elevation map: GeoTIFF or another "
         f"raster of local pixels that GDAL reads, {OTHERS}.",
     )
-    parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
-    options.add_robot_alone(parser)
-    options.add_contact_model(parser, "tyre")
+    options.add_site(parser)
     parser.add_argument(
         "--method",
         choices=("passes", "geometric"),
         default="passes",
         help="simulate passes, or compute the cost map of UNSTR-NAV, which has no headings, as a baseline (passes)",
     )
-    parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
-    parser.add_argument(
-        "--stride",
-        type=float,
-        metavar="M",
-        help="metres between places (0.25, or as many coarse cells as make up that)",
-    )
-    parser.add_argument(
-        "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
-    )
-    options.add_reading(parser)
     parser.add_argument(
         "--grid-map", type=user_path, metavar="FILE", help="also write a GridMap of ROS 2 to this file, .mcap or .db3"
     )
@@ -51,8 +37,7 @@ def add(commands: options.Commands) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Maps the site and writes the results."""
-    from travjax.site.ground import SiteGround
-    from travjax.site.mapping import coarse_note, save_map, setup_of
+    from travjax.site.mapping import save_map, say_notes, setup_of
 
     passes = arguments.robot, arguments.headings, arguments.stride
     if arguments.method == "geometric":
@@ -61,17 +46,9 @@ def run(arguments: argparse.Namespace) -> None:
             require(given is None, f"--{name.replace('_', '-')}", str(given), "left out with --method geometric")
     if arguments.spacing is not None or not arguments.allow_coarse:  # refuses what is wrong before the site is read
         setup_of(*passes, 0.0625 if arguments.spacing is None else arguments.spacing, arguments.contact)
-    site = SiteGround.open(
-        arguments.site,
-        arguments.spacing,
-        reading=options.reading(arguments),
-        fill_holes=not arguments.keep_holes,
-        allow_coarse=arguments.allow_coarse,
-    )
+    site = options.site(arguments)
     setup = setup_of(*passes, site.spacing, arguments.contact)
-    for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
-        if line:
-            progress.say(f"{arguments.site}: {line}")
+    say_notes(site, setup)
     if arguments.method == "geometric":
         from travjax.site.geometric import save_geometric
 

@@ -4,12 +4,16 @@ import argparse
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from travjax import options, progress
 from travjax.config import require
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
+
+if TYPE_CHECKING:
+    from travjax.planning.planner import Planner
+    from travjax.site.ground import SiteGround
 
 ACTION_SPACE = "action-space"
 
@@ -26,7 +30,6 @@ def add(commands: options.Commands) -> None:
         "each pose simulated once more in the end. Writes the path and a figure; without a path, the reason, a figure "
         f"and exit code 1. A site is an elevation map: GeoTIFF or another raster that GDAL reads, {OTHERS}.",
     )
-    parser.add_argument("site", type=user_path, metavar="SITE", help="elevation map file")
     numbers: Any = dict(nargs="+", type=float, metavar=("X Y", "DEG"))
     where = "x and y of the site, and the heading in degrees anticlockwise from +y (north) if it matters"
     parser.add_argument("--from", dest="start", help=f"where the path begins: {where}", **numbers)
@@ -41,8 +44,7 @@ def add(commands: options.Commands) -> None:
         help="what points are: x and y (site), latitude and longitude in degrees (latlon), or row and column of nodes, "
         "counted from the south-west (rowcol)",
     )
-    options.add_robot_alone(parser)
-    options.add_contact_model(parser, "tyre")
+    options.add_site(parser)
     parser.add_argument(
         "--primitives", type=user_path, metavar="FILE", help=".toml file of what the robot may do and what that costs"
     )
@@ -55,16 +57,6 @@ def add(commands: options.Commands) -> None:
     )
     parser.add_argument(
         "--threshold", type=float, default=0.5, metavar="P", help="probability of failure that is too much (0.5)"
-    )
-    parser.add_argument("--headings", type=int, default=16, metavar="H", help="headings around the circle (16)")
-    parser.add_argument(
-        "--stride",
-        type=float,
-        metavar="M",
-        help="metres between places (0.25, or as many cells as make that up)",
-    )
-    parser.add_argument(
-        "--spacing", type=float, metavar="M", help="metres between nodes (0.0625; with --allow-coarse the site's own)"
     )
     parser.add_argument(
         "--interval", type=float, default=0.06, metavar="M", help="metres between simulated poses (0.06)"
@@ -96,7 +88,6 @@ def add(commands: options.Commands) -> None:
     parser.add_argument(
         "--ros-path", type=user_path, metavar="FILE", help="also write the path as nav_msgs/Path, .mcap or .db3"
     )
-    options.add_reading(parser)
     options.add_out(parser, "runs/plan")
     parser.set_defaults(run=run)
 
@@ -106,58 +97,16 @@ def run(arguments: argparse.Namespace) -> int:
     from travjax.plan_results.plan_report import save_no_path, save_plan, save_to_go
     from travjax.plan_results.route_graph import route_graph, save_route_graph
     from travjax.planning.action_space import ActionSpacePlanner
-    from travjax.planning.field_judge import FieldJudge
-    from travjax.planning.motions import Motions
     from travjax.planning.no_path import NoPathError
-    from travjax.planning.planner import Planner
     from travjax.planning.to_go import CostToGo
-    from travjax.rasters.recordings import require_recording
-    from travjax.runs.predictor import Predictor
-    from travjax.simulation.contact import spacing_note
-    from travjax.site.ground import SiteGround
-    from travjax.site.mapping import coarse_note
+    from travjax.site.mapping import say_notes
 
     goal, via = _point("--to", arguments.goal), [_point("--via", point) for point in arguments.via]
-    require(arguments.start or arguments.to_go, "--from", None, "given, unless --to-go is")
     start = _point("--from", arguments.start) if arguments.start else None
-    for option, given in (("--via", via), ("--ros-path", arguments.ros_path)):
-        require(start is not None or not given, option, given, "left out where --from is")
-    if arguments.planner == ACTION_SPACE:
-        unused = ("via", "to_go", "estimator", "unknown_cost", "primitives")
-        for name in unused:
-            given = getattr(arguments, name)
-            require(not given, f"--{name.replace('_', '-')}", str(given), f"left out with --planner {ACTION_SPACE}")
-    if arguments.ros_path:
-        require_recording("--ros-path", arguments.ros_path)
-    motions = Motions.load(arguments.primitives) if arguments.primitives else None
-    site = SiteGround.open(
-        arguments.site,
-        arguments.spacing,
-        reading=options.reading(arguments),
-        fill_holes=not arguments.keep_holes,
-        allow_coarse=arguments.allow_coarse,
-    )
-    judge, contact = None, arguments.contact
-    if arguments.estimator:
-        require(arguments.unknown_cost is None, "--unknown-cost", arguments.unknown_cost, "left out with --estimator")
-        predictor = Predictor.load(arguments.estimator)
-        judge = partial(FieldJudge, predictor=predictor, threshold=arguments.threshold)
-        contact = contact or predictor.run.setup.contact.model
-    planner = Planner(
-        site,
-        arguments.robot,
-        motions,
-        headings=arguments.headings,
-        stride=arguments.stride,
-        contact=contact,
-        interval=arguments.interval,
-        unknown_cost=arguments.unknown_cost,
-        judge=judge,
-    )
-    setup = planner.setup
-    for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
-        if line:
-            progress.say(f"{arguments.site}: {line}")
+    _require_together(arguments)
+    site = options.site(arguments)
+    planner = _planner(arguments, site)
+    say_notes(site, planner.setup)
     if arguments.route_graph:
         graph = route_graph(planner)
         for note in graph.notes:
@@ -176,6 +125,51 @@ def run(arguments: argparse.Namespace) -> int:
         save_no_path(error, planner, arguments.out)
         return NO_PATH
     return 0
+
+
+def _require_together(arguments: argparse.Namespace) -> None:
+    """Raises InputError where options do not go together, or a recording could not be written."""
+    from travjax.rasters.recordings import require_recording
+
+    require(bool(arguments.start or arguments.to_go), "--from", None, "given, unless --to-go is")
+    for name in ("via", "ros_path"):
+        _require_left_out(arguments, name, arguments.start is None, "where --from is")
+    for name in ("via", "to_go", "estimator", "unknown_cost", "primitives"):
+        by_trajectories = arguments.planner == ACTION_SPACE
+        _require_left_out(arguments, name, by_trajectories, f"with --planner {ACTION_SPACE}")
+    _require_left_out(arguments, "unknown_cost", arguments.estimator is not None, "with --estimator")
+    if arguments.ros_path:
+        require_recording("--ros-path", arguments.ros_path)
+
+
+def _require_left_out(arguments: argparse.Namespace, name: str, here: bool, where: str) -> None:
+    given = getattr(arguments, name)
+    require(not (here and given), f"--{name.replace('_', '-')}", given and str(given), f"left out {where}")
+
+
+def _planner(arguments: argparse.Namespace, site: "SiteGround") -> "Planner":
+    """Returns the planner of a site; raises InputError where settings and estimator do not fit."""
+    from travjax.planning.field_judge import FieldJudge
+    from travjax.planning.motions import Motions
+    from travjax.planning.planner import Planner
+    from travjax.runs.predictor import Predictor
+
+    judge, contact = None, arguments.contact
+    if arguments.estimator:
+        predictor = Predictor.load(arguments.estimator)
+        judge = partial(FieldJudge, predictor=predictor, threshold=arguments.threshold)
+        contact = contact or predictor.run.setup.contact.model
+    return Planner(
+        site,
+        arguments.robot,
+        Motions.load(arguments.primitives) if arguments.primitives else None,
+        headings=arguments.headings,
+        stride=arguments.stride,
+        contact=contact,
+        interval=arguments.interval,
+        unknown_cost=arguments.unknown_cost,
+        judge=judge,
+    )
 
 
 def _point(option: str, numbers: Sequence[float]) -> tuple[float, ...]:

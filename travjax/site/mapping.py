@@ -19,6 +19,7 @@ from travjax.memory import require_memory
 from travjax.rasters.grid_maps import write_grid_map
 from travjax.rasters.raster import COARSEST
 from travjax.rasters.recordings import require_recording
+from travjax.simulation.contact import spacing_note
 from travjax.simulation.robot import Robot
 from travjax.simulation.setup import chosen_robot
 from travjax.site import site_figures
@@ -236,6 +237,13 @@ def _shares(passable: np.ndarray, known: np.ndarray) -> dict[str, float]:
         kinds = kinds_of(passable[top : top + 512], known[top : top + 512])
         counts += np.bincount(kinds.ravel(), minlength=len(KINDS))
     return dict(zip(KINDS, (counts / known.size).tolist(), strict=True))
+
+
+def say_notes(site: SiteGround, setup: SiteSetup) -> None:
+    """Prints how a site was read, and what its cells or the spacing of nodes mean for the events."""
+    for line in (*site.notes, coarse_note(site, setup.robot) or spacing_note(setup.contact, setup.spacing)):
+        if line:
+            progress.say(f"{site.path}: {line}")
 
 
 def coarse_note(site: SiteGround, robot: Robot) -> str | None:
