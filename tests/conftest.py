@@ -50,6 +50,7 @@ LONGEST = [
     *("resnet/test_convolution.py", "physics/test_physics.py", "terrain/test_styles.py", "commands/test_predict.py"),
     *("estimators/test_map_estimator.py", "runs/test_checkpoint.py", "test_wheel.py", "resnet/test_network.py"),
     *(
+        "planning/test_oracle.py",
         "site/test_kernel.py",
         "site/test_mapping.py",
         "evaluation/test_map_figures.py",

@@ -150,29 +150,30 @@ class Exhaustive:
         headings = range(self.lattice.headings) if heading is None else [heading]
         return [(row, col, one) for one in headings if self.stands(row, col, one)]
 
-    def from_states(self, starts: dict[State, float]) -> dict[State, float]:
-        """Returns the cost of the cheapest path to every state that can be reached; starts: what theirs is already."""
-        best, done = dict(starts), dict[State, float]()
+    def cheapest(self, points: Sequence[tuple[int, int, int | None]]) -> float:
+        """Returns the cost of the cheapest path past places, in a heading or any; inf where there is none."""
+        costs = dict.fromkeys(self.states(*points[0]), 0.0)
+        for point in points[1:]:
+            costs = self._reached(costs, set(self.states(*point)), every=point is not points[-1])
+        return min(costs.values(), default=math.inf)
+
+    def _reached(self, starts: dict[State, float], goals: set[State], every: bool) -> dict[State, float]:
+        """Returns what the cheapest path costs to each goal that can be reached, or to one; starts: what theirs is."""
+        best, done, reached = dict(starts), set[State](), dict[State, float]()
         heap = [(cost, state) for state, cost in starts.items()]
         heapq.heapify(heap)
-        while heap:
+        while heap and len(reached) < (len(goals) if every else 1):
             cost, state = heapq.heappop(heap)
             if state in done:
                 continue
-            done[state] = cost
+            done.add(state)
+            if state in goals:
+                reached[state] = cost
             for end, more in self.edges(state):
                 if cost + more < best.get(end, math.inf):
                     best[end] = cost + more
                     heapq.heappush(heap, (cost + more, end))
-        return done
-
-    def cheapest(self, points: list[tuple[int, int, int | None]]) -> float:
-        """Returns the cost of the cheapest path past places, in a heading or any; inf where there is none."""
-        costs = dict.fromkeys(self.states(*points[0]), 0.0)
-        for point in points[1:]:
-            reached = self.from_states(costs)
-            costs = {state: reached[state] for state in self.states(*point) if state in reached}
-        return min(costs.values(), default=math.inf)
+        return reached
 
 
 def length_of(motion: Motion) -> float:
@@ -252,8 +253,7 @@ def check_path(path: Path, legs: Sequence[Leg], ground: Site, setup: SiteSetup, 
             continue
         if turning[row] or row == 0:
             margins["step"] = 0.0
-        elif setup.contact == "nearest" and not path.known[row - 1]:  # a change from what is unknown
-            assert np.isnan(path.step[row])
+        elif setup.contact == "nearest" and not path.known[row - 1]:  # a change from what is unknown, at least in part
             margins["step"] = seen[0] = 0.0
         wanted = [margins["step"], margins["obstacle"], margins["tilt"]]
         wanted.append(whole.state(*poses[row]).centre + ground.height_offset)
