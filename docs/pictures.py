@@ -25,7 +25,8 @@ INK, PALE, SHADE = "#222222", "#8a8a8a", "#d9d9d9"
 
 PACKAGES = [
     {"commands": "parse, call the library, print", "experiments": "the paper's, and a comparison"},
-    {"training": "trainer and step; evaluation", "physics": "MuJoCo", "plan_results": "paths: files, figures"},
+    {"training": "the trainer and its step; evaluation on test maps", "physics": "trajectories driven in MuJoCo"},
+    {"navigation": "plan on what a sensor saw, drive on the truth", "plan_results": "files and figures of paths"},
     {"planning": "paths on whole sites, or why there is none"},
     {"runs": "a run on disk: checkpoints, model file, predictors"},
     {"estimators": "presets, samples, losses", "site": "maps of whole sites"},

@@ -83,7 +83,8 @@ class Predictor:
         own = self.run.setup
         model = Contact.from_model(contact, own.contact.turn) if contact else own.contact
         given = Setup(robot or own.robot, actions or own.actions, grid or own.grid, model)
-        for part, *_ in own.differences(given):
+        parts = [part for part, *_ in own.differences(given)]
+        for part in sorted(parts, key=lambda part: part != "contact"):  # which decides what of a robot matters
             wanted, other = getattr(own, part), getattr(given, part)
             if part == "robot":
                 same = " of other dimensions or limits" if other.name == wanted.name else ""
