@@ -8,10 +8,10 @@ import argparse
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from travjax import progress
-from travjax.config import InputError, read_json, require, to_json
+from travjax.config import InputError, from_json, read_json, require, to_json
+from travjax.data.sensor_noise import FILTERS
 from travjax.evaluation import map_figures
 from travjax.experiments import launch
 from travjax.experiments.robustness import BenchmarkMaps
@@ -73,12 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _trials(config: NavigationConfig, field: Predictor, out: Path) -> tuple[list[Trial], Mapping[str, str]]:
     """Returns the trials, those of an earlier run with the same settings included, and the chosen filters."""
     settings = {"config": to_json(config), "field": field.run.setup.to_json()}
-    done: dict[str, Any] = settings | {"filters": {}, "trials": []}
-    if (out / DONE).is_file():
-        done = read_json(out / DONE)
-    same = {name: done.get(name) for name in settings} == json.loads(json.dumps(settings))
-    require(same, "--out", str(out), "a folder without results of other settings")
-    trials, chosen = [Trial(**one) for one in done["trials"]], done["filters"]
+    trials, chosen = _earlier(out / DONE, settings) if (out / DONE).is_file() else ([], {})
     if not chosen:
         maps = BenchmarkMaps.synthetic(config.validation, config.seed - 1000, field.run.setup)
         chosen = best_filters(maps, config.seed)
@@ -95,6 +90,24 @@ def _trials(config: NavigationConfig, field: Predictor, out: Path) -> tuple[list
     if not trials:
         raise InputError("tasks: no ground has a task; allowed: a smaller `least`, or other ground")
     return trials, chosen
+
+
+def _earlier(file: Path, settings: dict) -> tuple[list[Trial], dict[str, str]]:
+    """Returns the trials of an earlier run and its filters; raises InputError for other settings and damaged files."""
+    saved = read_json(file)
+    names = {*settings, "filters", "trials"}
+    require(isinstance(saved, dict) and saved.keys() == names, str(file), type(saved).__name__, "results of navigation")
+    same = {name: saved[name] for name in settings} == json.loads(json.dumps(settings))
+    require(same, "--out", str(file.parent), "a folder without results of other settings")
+    filters, rows = saved["filters"], saved["trials"]
+    corruptions = settings["config"]["corruptions"]
+    known = isinstance(filters, dict) and all(filters.get(name) in FILTERS for name in corruptions)
+    require(known, f"{file}: filters", filters, "a filter for each corruption")
+    require(isinstance(rows, list), f"{file}: trials", type(rows).__name__, "a list")
+    try:
+        return [from_json(row, Trial, file) for row in rows], filters
+    except InputError as error:
+        raise InputError(f"{file}: trials: {error}") from None
 
 
 def _write(trials: list[Trial], chosen: Mapping[str, str], config: NavigationConfig, out: Path) -> None:

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from travjax.config import InputError
+from travjax.config import InputError, require, require_number
 from travjax.data.sensor_noise import CORRUPTIONS
 from travjax.navigation.methods import planners
 from travjax.navigation.tasks import Ground, NavigationConfig, Task
@@ -15,7 +15,7 @@ from travjax.planning.path import drive
 from travjax.planning.planner import Planner
 from travjax.runs.predictor import Predictor
 
-ARRIVED, FAILED, REFUSED = "arrived", "failed", "refused"
+ENDS = ARRIVED, FAILED, REFUSED = "arrived", "failed", "refused"
 """How a task ends: at the goal, beyond a limit of the robot on the way, or without a path."""
 
 
@@ -30,6 +30,15 @@ class Trial:
     method: str
     ended: str
     detour: float = 0.0
+
+    def __post_init__(self):
+        for name in ("kind", "corruption", "method"):
+            require(isinstance(getattr(self, name), str), name, getattr(self, name), "a name")
+        for name in ("ground", "task"):
+            value = getattr(self, name)
+            require(type(value) is int and value >= 0, name, value, "a whole number from 0 on")
+        require(self.ended in ENDS, "ended", self.ended, f"one of {', '.join(ENDS)}")
+        require_number("detour", self.detour, -1e-300, 1e9, "a ratio of lengths")
 
     def to_json(self) -> dict:
         """Returns it for a JSON file."""
