@@ -251,6 +251,7 @@ def check_path(path: Path, legs: Sequence[Leg], ground: Site, setup: SiteSetup, 
         if margins is None:
             assert np.isnan(seen).all() and not path.exceeds[row]
             continue
+        reached = margins["step"]
         if turning[row] or row == 0:
             margins["step"] = 0.0
         elif setup.contact == "nearest" and not path.known[row - 1]:  # a change from what is unknown, at least in part
@@ -258,6 +259,8 @@ def check_path(path: Path, legs: Sequence[Leg], ground: Site, setup: SiteSetup, 
         wanted = [margins["step"], margins["obstacle"], margins["tilt"]]
         wanted.append(whole.state(*poses[row]).centre + ground.height_offset)
         errors["simulated"] = max(errors["simulated"], float(np.abs(np.subtract(seen, wanted)).max()))
+        if setup.contact == "tyre" and row + 1 < len(poses) and not turning[row + 1]:
+            margins["step"] = reached  # a drive begins here, on what its tyres reach
         share = max(margins[name] / limit for name, limit in limits.items())
         errors["share"] = max(errors["share"], share)
         assert path.exceeds[row] == (share > 1 + 1e-6)

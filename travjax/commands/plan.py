@@ -71,7 +71,8 @@ def add(commands: options.Commands) -> None:
         "--unknown-cost",
         type=float,
         metavar="K",
-        help="drive over unknown ground, at K times the cost of the worst safe ground (never)",
+        help="drive over unknown ground, at K times the cost of the worst safe ground (never); what stands between "
+        "unknown ground is not seen then",
     )
     parser.add_argument(
         "--to-go",

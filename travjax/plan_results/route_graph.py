@@ -80,7 +80,7 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
     drives = tuple(Primitive(angle, ((math.inf, length),)) for angle, length in zip(angles, lengths, strict=True))
     judge = MarginJudge(ground, setup, lattice, planner.unknown_cost)  # whatever that of the planner is
     ahead, _ = judge.judged(site_margins(ground, replace(nodes, primitives=drives)), turning=False)
-    turns = replace(nodes, primitives=tuple(turn.primitive for turn in lattice.turns))
+    turns = replace(nodes, primitives=tuple(turn.primitive for turn in lattice.point_turns))
     around, _ = judge.judged(site_margins(ground, turns), turning=True)
     place = np.full(around.shape[1:], -1)  # number of the node there
     rows, cols = np.nonzero(np.isfinite(around).all(axis=0))

@@ -56,7 +56,7 @@ class MarginJudge:
         self._ground, self._robot, self._risk = ground, setup.robot, lattice.motions.risk
         self.unknown_allowed = unknown_cost is not None
         self._unknown = np.inf if unknown_cost is None else unknown_cost * (1 + self._risk)
-        groups = (lattice.straights, lattice.curves, lattice.turns)  # a kernel runs over as many poses for each
+        groups = (lattice.straights, lattice.curves, lattice.point_turns)  # a kernel runs over as many poses for each
         self._setups = [replace(setup, primitives=tuple(one.primitive for one in group)) for group in groups if group]
         self._standing = replace(setup, primitives=tuple(PointTurn(angle) for angle in lattice.angles.tolist()))
 

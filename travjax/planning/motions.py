@@ -5,14 +5,16 @@ another, the same way from every place. Drives are biarcs, so that they end on a
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import product
 from numbers import Integral
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from travjax.config import load_toml, require, require_length, require_number
 from travjax.planning.biarcs import Arc, biarc
@@ -99,16 +101,29 @@ class Motion:
     turned: float
 
 
-@dataclass(frozen=True)
-class Moves:
-    """Steps of a search from state to state, [H, M] each: M for each heading in which one may be.
+class Step(NamedTuple):
+    """A step of a search from a state to another.
 
-    motion:      number of the motion, -1 where there is no further one
+    motion:      number of the motion, -1 for none
     rows, cols:  places that the step leads to; end: the heading in which it ends
     from_rows, from_cols: from here to the place where the motion begins, whose cost it is
     factor:      of that cost
     backwards:   whether the motion is gone through from its end to its beginning
     """
+
+    motion: int
+    rows: int
+    cols: int
+    end: int
+    from_rows: int
+    from_cols: int
+    factor: float
+    backwards: bool
+
+
+@dataclass(frozen=True)
+class Moves:
+    """All steps of a search, [H, M] of each field of Step: M for each heading in which one may be; some are none."""
 
     motion: Int[np.ndarray, "h m"]
     rows: Int[np.ndarray, "h m"]
@@ -117,7 +132,21 @@ class Moves:
     from_rows: Int[np.ndarray, "h m"]
     from_cols: Int[np.ndarray, "h m"]
     factor: Float[np.ndarray, "h m"]
-    backwards: Int[np.ndarray, "h m"]
+    backwards: Bool[np.ndarray, "h m"]
+
+    @staticmethod
+    def from_steps(steps: Sequence[Sequence[Step]]) -> "Moves":
+        """Returns the steps from each heading as arrays."""
+        most = max(map(len, steps))
+        require(most * len(steps) < MOST_STEPS, "turns", most * len(steps), f"fewer than {MOST_STEPS} steps in all")
+        nothing = Step(-1, 0, 0, 0, 0, 0, 1.0, False)
+        padded = [[*some, *[nothing] * (most - len(some))] for some in steps]
+        field = lambda name: np.array([[getattr(one, name) for one in some] for some in padded])
+        return Moves(**{name: field(name) for name in Step._fields})
+
+    def step(self, heading: int, number: int) -> Step:
+        """Returns one of the steps from a heading."""
+        return Step(*(getattr(self, name)[heading, number].item() for name in Step._fields))
 
 
 @dataclass(frozen=True)
@@ -162,7 +191,7 @@ class MotionLattice:
         return self.straights + self.curves
 
     @cached_property
-    def turns(self) -> tuple[Motion, ...]:
+    def point_turns(self) -> tuple[Motion, ...]:
         """The point turns to the left, from each heading to the next; turns to the right go through them backwards."""
         if not self.motions.point_turns or self.headings == 1:
             return ()
@@ -176,7 +205,7 @@ class MotionLattice:
     @cached_property
     def all(self) -> tuple[Motion, ...]:
         """All motions: straight drives, curves, point turns."""
-        return self.straights + self.curves + self.turns
+        return self.straights + self.curves + self.point_turns
 
     @cached_property
     def costs(self) -> Float[np.ndarray, " motions"]:
@@ -186,36 +215,26 @@ class MotionLattice:
     @cached_property
     def moves(self) -> Moves:
         """The steps from each heading."""
-        steps: list[list[tuple]] = [[] for _ in range(self.headings)]
+        steps: list[list[Step]] = [[] for _ in range(self.headings)]
         for number, motion in enumerate(self.all):
-            there, turn = (motion.rows, motion.cols), isinstance(motion.primitive, PointTurn)
-            steps[motion.heading].append((number, *there, motion.end, 0, 0, 1.0, 0))
+            turn = isinstance(motion.primitive, PointTurn)
+            steps[motion.heading].append(Step(number, motion.rows, motion.cols, motion.end, 0, 0, 1.0, False))
             if turn or self.motions.reverse:
                 back = (-motion.rows, -motion.cols)
                 factor = 1.0 if turn else self.motions.reversing
-                steps[motion.end].append((number, *back, motion.heading, *back, factor, 1))
-        return _moves(steps)
+                steps[motion.end].append(Step(number, *back, motion.heading, *back, factor, True))
+        return Moves.from_steps(steps)
 
     @cached_property
     def moves_back(self) -> Moves:
         """The steps of a search from the goal: from the end of each of `moves` to where it begins."""
-        steps: list[list[tuple]] = [[] for _ in range(self.headings)]
-        moves = self.moves
-        for heading, step in zip(*np.nonzero(moves.motion >= 0), strict=True):
-            motion, rows, cols, end, from_rows, from_cols, factor, backwards = (
-                field[heading, step].item() for field in vars(moves).values()
-            )
-            begins = from_rows - rows, from_cols - cols
-            steps[end].append((motion, -rows, -cols, int(heading), *begins, factor, backwards))
-        return _moves(steps)
-
-
-def _moves(steps: list[list[tuple]]) -> Moves:
-    most = max(map(len, steps))
-    require(most * len(steps) < MOST_STEPS, "turns", most * len(steps), f"fewer than {MOST_STEPS} steps in all")
-    nothing = (-1, 0, 0, 0, 0, 0, 1.0, 0)
-    fields = zip(*(zip(*(*of, *[nothing] * (most - len(of))), strict=True) for of in steps), strict=True)
-    return Moves(*(np.array(field, np.float64 if number == 6 else np.int32) for number, field in enumerate(fields)))
+        steps: list[list[Step]] = [[] for _ in range(self.headings)]
+        for heading, number in zip(*np.nonzero(self.moves.motion >= 0), strict=True):
+            one = self.moves.step(heading, number)
+            begins = one.from_rows - one.rows, one.from_cols - one.cols
+            back = Step(one.motion, -one.rows, -one.cols, int(heading), *begins, one.factor, one.backwards)
+            steps[one.end].append(back)
+        return Moves.from_steps(steps)
 
 
 @lru_cache(maxsize=1)

@@ -94,7 +94,8 @@ class Path:
     motion:   [p] names of the motion that leads to each pose
     step, obstacle, tilt: [p] metres and radians; step is that from the pose before, 0 at the first one and in turns
     known:    [p] whether all ground that is touched is known
-    share:    [p] the largest margin as a share of its limit, of all events of the robot; NaN on unknown ground
+    share:    [p] the largest margin as a share of its limit, of all events of the robot; NaN on unknown ground. It
+              includes, of `tyre`, the step that tyres reach where a drive begins
     exceeds:  [p] whether a limit of the robot is exceeded
     """
 
@@ -133,9 +134,10 @@ def drive(
     turning = np.array([legs[number].turning for number in owner] if legs else [True])
     seen = list(_simulated(poses, ground, setup))
     step, obstacle, tilt, roll, known, z = (np.concatenate(field) for field in zip(*seen, strict=True))
+    values = {"step": np.where(_counts(turning, setup.contact), step, 0), "obstacle": obstacle, "tilt": tilt}
+    values["roll"] = np.abs(roll)
     step = np.where(turning & known, 0, step)
     step[0] = np.where(known[0], 0, np.nan)
-    values = {"step": step, "obstacle": obstacle, "tilt": tilt, "roll": np.abs(roll)}
     robot = setup.robot
     shares = [values[event.name] / limit for event, limit in zip(robot.events, robot.limits, strict=True)]
     share = np.fmax.reduce(shares)  # a step from unknown ground is not known, the other margins are
@@ -146,6 +148,14 @@ def drive(
     distance = _arc_lengths(poses, along)
     exceeds = share > 1 + TOLERANCE
     return Path(pose, z + ground.height_offset, distance, names, step, obstacle, tilt, known, share, exceeds), owner
+
+
+def _counts(turning: Bool[np.ndarray, " p"], contact: str) -> Bool[np.ndarray, " p"]:
+    """Returns at which poses the step counts: those that drives lead to; of `tyre` also where drives begin."""
+    drives = ~turning
+    if contact == "tyre":
+        drives = drives | np.append(drives[1:], False)
+    return drives
 
 
 def _arc_lengths(poses: np.ndarray, chords: np.ndarray) -> np.ndarray:

@@ -72,12 +72,13 @@ class Search:
         wanted = np.zeros(len(self.best) if goals is not None else 0, bool)
         chosen = np.array(sorted(goals) if goals is not None else [], np.int64)
         wanted[chosen] = ~self.closed[chosen]
+        moves = self.moves
+        fields = (moves.motion, moves.rows, moves.cols, moves.end, moves.from_rows, moves.from_cols, moves.factor)
         while True:
             reached = int(self.closed[chosen].sum())
             left = len(chosen) - reached if every else int(reached == 0 and len(chosen) > 0)
             if goals is not None and left == 0:
                 return reached
-            fields = tuple(vars(self.moves).values())[:7]
             shape = self.rows, self.cols, self.headings
             ended, place, *self._heap, self._size = _advance(
                 *self._heap, self._size, self.best, self.arrived, self.closed, self.bound.ravel(), costs.cost,
