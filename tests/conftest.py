@@ -3,9 +3,9 @@
 Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
 
 Compiled code is kept in a folder that the processes of a session share, and the sessions after it: most of the tests'
-time is XLA's, and it compiles many programs several times. What is in the folder is found by the program and the version
-of XLA, so changed code is compiled anew. XLA optimises as it does for users: BUILD_NOTES.md (failed trials: commands and
-what programs share) says what less of it would save.
+time is XLA's, and it compiles many programs several times. Code is found again by the program itself, its options and
+the version of XLA, so what has changed is compiled anew. XLA optimises as it does for users: BUILD_NOTES.md (failed
+trials: commands and what programs share) says what less of it would save.
 """
 
 import gc
