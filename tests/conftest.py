@@ -2,9 +2,10 @@
 
 Tests run on the CPU; those marked `gpu` run with `JAX_PLATFORMS=cuda,cpu pytest -m gpu`.
 
-Compiled code is kept in a folder that is new for each session and shared by its processes: most of the tests' time is
-XLA's, and it compiles many programs several times. XLA optimises as it does for users: BUILD_NOTES.md (failed trials:
-commands and what programs share) says what less of it would save.
+Compiled code is kept in a folder that the processes of a session share, and the sessions after it: most of the tests'
+time is XLA's, and it compiles many programs several times. Code is found again by the program itself, its options and
+the version of XLA, so what has changed is compiled anew. XLA optimises as it does for users: BUILD_NOTES.md (failed
+trials: commands and what programs share) says what less of it would save.
 """
 
 import gc
@@ -68,16 +69,30 @@ def place_of(item) -> int:
     return LONGEST.index(file) if file in LONGEST else len(LONGEST)
 
 
+MOST_COMPILED_CODE = 1 << 30
+"""Bytes; a session that finds more begins with an empty folder."""
+
+
+def compiled_code(config) -> str:
+    """The folder of compiled code, under .pytest_cache, which `make clean` and `pytest --cache-clear` remove."""
+    if not hasattr(config, "cache"):  # -p no:cacheprovider
+        return tempfile.mkdtemp(prefix="travjax-tests-")
+    folder = config.cache.mkdir("compiled-code")
+    if sum(path.stat().st_size for path in folder.iterdir()) > MOST_COMPILED_CODE:
+        shutil.rmtree(folder)
+    return str(folder)
+
+
 def pytest_configure(config):
     if not hasattr(config, "workerinput"):  # workers of pytest-xdist, and programs that tests start, inherit the folder
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = tempfile.mkdtemp(prefix="travjax-tests-")
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = compiled_code(config)
     jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def pytest_unconfigure(config):
-    if not hasattr(config, "workerinput"):
+    if not hasattr(config, "workerinput") and not hasattr(config, "cache"):
         shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 

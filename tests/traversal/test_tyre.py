@@ -19,6 +19,7 @@ from travjax.traversal.tyre_trajectories import turn_poses
 
 STRAIGHT = ActionSpace(turns=8, radii=(math.inf,), interval=0.1)
 ONE_AHEAD = replace(STRAIGHT, turns=1)
+AHEAD_AND_BACK = ActionSpace(turns=2, radii=(math.inf,), interval=0.3)
 SPACINGS = (0.04, 0.0625, 0.1)
 
 SETUPS = {
@@ -198,8 +199,8 @@ def test_a_point_turn_meets_a_rock_beside_the_robot(grounds):
 
 def test_point_turns_can_be_left_out():
     x, y = np.meshgrid(Grid().axis(), Grid().axis())
-    margins = simulate(rock_beside(x, y), SEEKUR_JR, STRAIGHT, contact="tyre", turn=False)
-    assert not np.asarray(failures(margins, SEEKUR_JR))[4].any()
+    margins = simulate(rock_beside(x, y), SEEKUR_JR, AHEAD_AND_BACK, contact="tyre", turn=False)
+    assert not np.asarray(failures(margins, SEEKUR_JR))[1].any(), "after half a turn"
 
 
 def test_stairs_fail_and_a_narrow_trench_does_not(grounds):
@@ -223,17 +224,17 @@ def bump_and_post() -> np.ndarray:
 @pytest.fixture(scope="module")
 def under_low(bump_and_post):
     """Margins of LOW straight on: [2, 1]."""
-    return simulate(bump_and_post, LOW, ONE_AHEAD, contact="tyre")
+    return simulate(bump_and_post, LOW, ONE_AHEAD, contact="tyre", turn=False)
 
 
 def test_the_ends_of_the_body_may_rise(bump_and_post, under_low):
     high = replace(LOW, nose_rise=0.15)
     assert bool(failures(under_low, LOW)[0, 0, 1])
-    assert not bool(failures(simulate(bump_and_post, high, ONE_AHEAD, contact="tyre"), high)[0, 0, 1])
+    assert not bool(failures(simulate(bump_and_post, high, ONE_AHEAD, contact="tyre", turn=False), high)[0, 0, 1])
 
 
 def test_what_is_beside_the_chassis_counts_with_its_own_height(bump_and_post, under_low):
-    above = simulate(bump_and_post, replace(LOW, overhang_height=0.3), ONE_AHEAD, contact="tyre")
+    above = simulate(bump_and_post, replace(LOW, overhang_height=0.3), ONE_AHEAD, contact="tyre", turn=False)
     assert float(under_low.obstacle[1, 0]) == pytest.approx(0.15, abs=1e-5) and above.obstacle[1, 0] <= 0
 
 
@@ -267,12 +268,11 @@ def test_turns_go_the_shorter_way_in_parts_of_at_most_five_degrees():
 def test_the_robots_file_decides_unless_an_argument_does():
     ground = rough(Grid(), 0)
     own = replace(SEEKUR_JR, contact="tyre")
-    few = ActionSpace(turns=2, radii=(math.inf,), interval=0.3)
-    by_file = simulate(ground, own, few, turn=False)
-    by_argument = simulate(ground, SEEKUR_JR, few, contact="tyre", turn=False)
+    by_file = simulate(ground, own, AHEAD_AND_BACK, turn=False)
+    by_argument = simulate(ground, SEEKUR_JR, AHEAD_AND_BACK, contact="tyre", turn=False)
     np.testing.assert_array_equal(by_file.step, by_argument.step)
-    paper = simulate(ground, own, few, contact="nearest")
-    np.testing.assert_array_equal(paper.step, simulate(ground, SEEKUR_JR, few).step)
+    paper = simulate(ground, own, AHEAD_AND_BACK, contact="nearest")
+    np.testing.assert_array_equal(paper.step, simulate(ground, SEEKUR_JR, AHEAD_AND_BACK).step)
     assert not np.array_equal(paper.step, by_file.step)
 
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from travjax.batching import in_batches
+from travjax.batching import BATCH, in_batches
 from travjax.config import InputError, require, require_number
 from travjax.jax_flags import key_of, usual_flags
 from travjax.simulation.arrays import integers, numbers
@@ -166,7 +166,9 @@ def sample_params(style: str | Sequence[str], seeds) -> tuple[TerrainParams, Int
     """
     styles, numbered = _styles_and_seeds(style, seeds, STYLES)
     index = np.array([STYLES.index(name) for name in styles], np.uint32)
-    values, noise_seeds = in_batches(lambda pair: _sample(*pair), (index, numbered.astype(np.uint32)))
+    fill = (0, -len(index) % BATCH)  # drawing takes no time, but each other size would take seconds to compile
+    pairs = np.pad(index, fill), np.pad(numbered.astype(np.uint32), fill)
+    values, noise_seeds = (drawn[: len(index)] for drawn in in_batches(lambda pair: _sample(*pair), pairs))
     return TerrainParams(*values.T), noise_seeds
 
 
