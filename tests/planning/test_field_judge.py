@@ -64,10 +64,10 @@ def test_probabilities_are_those_of_the_network_at_the_poses(planner, predictor)
 
 
 def test_motions_over_unknown_ground_and_improbable_ones_are_impossible(planner):
-    factor, in_the_way = planner.costs.judge.motions(Tile(0, 0, 32))
+    factor, in_the_way = planner.costs.judge.motions(Tile(0, 0, 8))
     assert (in_the_way[:, :2, :2] == UNKNOWN).all()
     assert np.array_equal(np.isinf(factor), in_the_way > 0)
-    light, _ = planner.costs.judge.weighing(0.0).motions(Tile(0, 0, 32))
+    light, _ = planner.costs.judge.weighing(0.0).motions(Tile(0, 0, 8))
     assert set(np.unique(light)) <= {1.0, np.inf} and np.array_equal(np.isinf(light), np.isinf(factor))
 
 
