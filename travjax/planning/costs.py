@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float32
 
+from travjax.memory import require_memory
 from travjax.planning.judges import Judge, Judged
 from travjax.planning.motions import MotionLattice
 from travjax.planning.path import Leg
@@ -31,7 +32,9 @@ class MotionCosts:
         self.ground, self.lattice, self.judge = ground, lattice, judge
         self.robot: Robot = setup.robot
         self.shape, self.tile = setup.lattice(ground.shape), TILE
-        places = self.shape[0] * self.shape[1]
+        places, headings = self.shape[0] * self.shape[1], lattice.headings
+        needed = places * (5 * len(lattice.all) + 40 * headings)  # also of a search, and of the margins of standing
+        require_memory(needed, f"a plan on {self.shape[0]} x {self.shape[1]} places", "; a longer stride takes less")
         self.cost = np.empty((places, len(lattice.all)), np.float32)
         self.in_the_way = np.empty((places, len(lattice.all)), np.uint8)
         self.evaluated = np.zeros(tuple(-(-count // TILE) for count in self.shape), bool)
