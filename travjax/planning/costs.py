@@ -1,12 +1,14 @@
 """The costs of motions on a site, asked from a judge tile by tile, when a search first comes to a tile."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float32
 
+from travjax import progress
 from travjax.memory import require_memory
 from travjax.planning.judges import Judge, Judged
 from travjax.planning.motions import MotionLattice
@@ -26,6 +28,7 @@ class MotionCosts:
     in_the_way: [places, motions] 0 for nothing, 1, 2, 3 ... for the robot's event of this number, or judges.UNKNOWN
     evaluated:  [tile rows, tile cols] of tiles of `tile` places a side, whether these are known
     refused:    how many motions were forbidden by `block`
+    on_progress: is called after each tile that was judged
     """
 
     def __init__(self, ground: Site, setup: SiteSetup, lattice: MotionLattice, judge: Judge):
@@ -39,6 +42,7 @@ class MotionCosts:
         self.in_the_way = np.empty((places, len(lattice.all)), np.uint8)
         self.evaluated = np.zeros(tuple(-(-count // TILE) for count in self.shape), bool)
         self.refused = 0
+        self.on_progress: Callable[[], object] = lambda: None
         self._pool = ThreadPoolExecutor(workers())
 
     @cached_property
@@ -63,6 +67,18 @@ class MotionCosts:
                 break
         for tile in self._pool.map(self._evaluate, missing):
             self.evaluated[tile] = True
+            self.on_progress()
+
+    @contextmanager
+    def watched(self, what: str, whole: bool) -> Iterator[None]:
+        """Shows how many tiles are judged; whole: whether these will be all tiles."""
+        left = self.evaluated.size - int(self.evaluated.sum())
+        with progress.bar(what, left if whole else None, "tile") as bar:
+            self.on_progress = bar.update
+            try:
+                yield
+            finally:
+                self.on_progress = lambda: None
 
     def block(self, leg: Leg) -> None:
         """Forbids a motion that the sequential simulators refuse."""

@@ -86,7 +86,8 @@ class Planner:
         """Plans a path; see `plan`."""
         points = self.points(start, goal, via, coordinates)
         self.require_standing(points[0])
-        return self.checked(points, lambda: self.cheapest(points))
+        with self.costs.watched("planning", whole=False):
+            return self.checked(points, lambda: self.cheapest(points))
 
     def points(self, start: Any, goal: Any, via: Sequence[Any] = (), coordinates: str = "site") -> list[Endpoint]:
         """Returns the places of the lattice where a path begins, passes and ends; see `plan`."""

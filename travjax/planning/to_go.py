@@ -34,7 +34,8 @@ class CostToGo:
         search = Search(lattice.moves_back, lattice.headings, np.where(np.isfinite(costs.easiest), 0.0, np.inf))
         for state in standing(self.goal, costs):
             search.start(state)
-        search.run(costs, None)
+        with costs.watched("cost to go", whole=True):
+            search.run(costs, None)
         return search
 
     @property
