@@ -14,12 +14,12 @@ from tests.fuzz.mutations import KINDS, mutated
 from tests.fuzz.worker import ACCEPTED, FAILED, REFUSED
 
 CASES = 10
-"""Of each format; `python -m tests.fuzz --case FORMAT:SEED` repeats one."""
+"""Cases of each format; `python -m tests.fuzz --case FORMAT:SEED` repeats one."""
 
 
 @pytest.fixture(scope="module")
 def findings() -> list[campaign.Finding]:
-    """Of all formats."""
+    """What the cases of all formats find."""
     return campaign.run(itertools.product(FORMATS, range(CASES)), list(FORMATS))
 
 

@@ -50,7 +50,7 @@ CONFIGS: dict[type, dict] = {
 
 
 def places(table: Any, before: tuple = ()) -> Iterator[tuple]:
-    """Of everything in nested tables and lists, from the outside to the inside."""
+    """Yields the places of everything in nested tables and lists, from the outside to the inside."""
     for key, value in table.items() if isinstance(table, dict) else enumerate(table):
         yield (*before, key)
         if isinstance(value, dict | list):

@@ -138,7 +138,7 @@ def test_a_number_has_four_digits_and_none_is_blank(value, text):
 
 
 def ten_samples() -> tuple[np.ndarray, np.ndarray]:
-    """Of ten samples, step: four fail, three found and one false alarm; obstacle: two fail, none found; tilt: none."""
+    """Ten samples, step: four fail, three found and one false alarm; obstacle: two fail, none found; tilt: none."""
     probabilities, failed = np.full((10, 3), 0.1), np.zeros((10, 3), bool)
     failed[:4, STEP] = failed[:2, OBSTACLE] = True
     probabilities[1:4, STEP] = [0.9, 0.8, 0.7]

@@ -36,7 +36,7 @@ def row(epoch: int, validation: float | None, **sites: Confusion) -> dict:
 
 
 def counts(tp: int, fp: int, fails: int = 4) -> Confusion:
-    """Of ten samples of which so many fail."""
+    """Scores of ten samples of which so many fail."""
     return Confusion(10 - fails - fp, fp, fails - tp, tp)
 
 

@@ -270,7 +270,7 @@ def _read_log(folder: Path) -> None:
 
 
 def _variables():
-    """Of a tiny hazard field; drawn by NumPy, since JAX would compile for seconds."""
+    """The arrays of a tiny hazard field; drawn by NumPy, since JAX would compile for seconds."""
     rng = np.random.default_rng(0)
     return jax.tree.map(lambda leaf: rng.uniform(0.1, 1, leaf.shape).astype(leaf.dtype), RUN.template(0))
 

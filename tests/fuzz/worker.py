@@ -24,7 +24,7 @@ MEMORY = 2 << 30
 """Bytes that reading may take beyond what the process has once everything is imported."""
 
 SECONDS = 20
-"""Of processor time that a file may take."""
+"""Seconds of processor time that a file may take."""
 
 ACCEPTED, REFUSED, FAILED = "accepted", "refused", "failed"
 

@@ -463,7 +463,7 @@ def test_names_of_hugging_face(tmp_path):
 
 
 FEATURES = 128
-"""Of NARROW."""
+"""Features of NARROW."""
 
 HEADS = {
     "of 10 classes": {"fc.weight": (10, FEATURES), "fc.bias": (10,)},
@@ -540,7 +540,7 @@ def test_names_of_detectron2(tmp_path):
 
 
 def caffe_arrays_by_canonical_name() -> dict[str, np.ndarray]:
-    """Of a first kernel that takes B, G, R from 0 to 255."""
+    """Arrays whose first kernel takes B, G, R from 0 to 255."""
     arrays = canonical_arrays(top=False)
     kernel = (arrays["conv1/kernel"] / (255 * STD)[:, None]).astype(np.float32)
     return arrays | {"conv1/kernel": np.ascontiguousarray(kernel[:, :, ::-1])}

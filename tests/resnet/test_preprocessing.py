@@ -20,7 +20,7 @@ UNITS = {
     "tf": (2 * STD, 2 * MEAN - 1, 1),
     "unit": (STD, MEAN, 1),
 }
-"""Of each input: scale and offset of R, G, B against (x / 255 - mean) / std, and the step through the colours."""
+"""For each input: scale and offset of R, G, B against (x / 255 - mean) / std, and the step through the colours."""
 
 KINDS = ("kernel", "gamma", "beta", "mean", "var")
 NAMES = {f"conv1/{kind}": f"first.{kind}" for kind in KINDS}

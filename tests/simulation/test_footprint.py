@@ -235,7 +235,7 @@ def views_of(**changes) -> set[View]:
 
 
 def test_the_paper_needs_a_quarter_of_its_first_arcs():
-    """Of 18 x 13 first arcs, (18 x 13 + 2) / 4: turns 0 and 9 straight on are their own mirror images."""
+    """There are (18 x 13 + 2) / 4 of 18 x 13 first arcs: turns 0 and 9 straight on are their own mirror images."""
     table = node_table(SEEKUR_JR, ActionSpace(), Grid())
     assert set(table.layout.views) == set(VIEWS)
     assert table.centre.shape == (59, 29 + 13 * 28)

@@ -17,7 +17,7 @@ from travjax.training.network_benchmark import COLUMNS, FLAX, TORCH, Bench, torc
 
 @pytest.fixture(scope="module")
 def rows() -> list[dict]:
-    """Of a small network, without PyTorch."""
+    """The rows of a small network, without PyTorch."""
     small = Bench(Setup(HUSKY, FEW, Grid(4, 0.125)), repeats=2, trunk=ResNetConfig((1,), 4))
     return [small.inputs(), small.training_step(), small.all_trajectories()]
 

@@ -15,7 +15,7 @@ from travjax.navigation.trials import ARRIVED, FAILED, REFUSED, Trial
 CONFIDENCE = 0.95
 
 COLOURS = ("#999999", "#0072b2", "#56b4e9", "#003a5c", "#e69f00", "#d55e00")
-"""Of METHODS; markers tell them apart without colour."""
+"""Colours of METHODS; markers tell them apart without colour."""
 
 MARKERS = "sovD^P"
 

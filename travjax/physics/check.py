@@ -25,7 +25,7 @@ TRACKED = 0.1
 """Metres from the path, at most, on flat ground."""
 
 YAW_RATIOS = (0.4, 1.0)
-"""Of the yaw rate to that which the wheels' speeds would give without slip; chattering contacts give a quarter."""
+"""Ratio of the yaw rate to that which the wheels' speeds would give without slip; chattering contacts give 0.25."""
 
 
 @dataclass(frozen=True)

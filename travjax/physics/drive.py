@@ -18,7 +18,7 @@ from travjax.simulation.physics_table import PhysicsConfig
 from travjax.simulation.robot import Robot
 
 VERSION = 3
-"""Of controller and thresholds; it is written beside all labels."""
+"""Version of controller and thresholds; it is written beside all labels."""
 
 OUTCOMES = ("stuck", "contact", "off_path", "tip", "tilt", "bad_start")
 """Ways to fail; a bad start is one at which the robot does not stand, and is no failure of the trajectory."""

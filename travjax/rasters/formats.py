@@ -19,10 +19,10 @@ BEGINNING = 2**16
 """Bytes of a file that are looked at."""
 
 TEXT_SUFFIXES = (".xyz", ".txt", ".csv", ".pts", ".asc", ".dat", ".grd", ".tsv", "")
-"""Of text that is taken as points where its beginning does not tell; .asc and .grd are grids as well."""
+"""Suffixes of text that is taken as points where its beginning does not tell; .asc and .grd are grids as well."""
 
 RASTER_TEXT = (".dem", ".gxf")
-"""Of rasters that are text."""
+"""Suffixes of rasters that are text."""
 
 MESH_SUFFIXES = (".obj", ".stl", ".gltf", ".glb")
 

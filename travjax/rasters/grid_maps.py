@@ -33,7 +33,7 @@ uint16 outer_start_index
 uint16 inner_start_index
 """,
 }
-"""Of the messages as ROS 2 has them, for recordings that do not carry them."""
+"""Definitions of the messages as ROS 2 has them, for recordings that do not carry them."""
 
 LISTED = 400
 """Characters of names that a message lists, at most."""

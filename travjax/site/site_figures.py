@@ -16,7 +16,7 @@ MOST = 1200
 """Pixels along an edge of a figure's map, at most; of larger sites every second, third ... place is drawn."""
 
 EVENT_COLOURS = ("#cfe8f7", "#e69f00", "#0072b2", "#5b1a3d", "#117733")
-"""Of no event and of each event; they differ in lightness."""
+"""Colours of no event and of each event; they differ in lightness."""
 
 
 def passable_figure(
