@@ -291,3 +291,12 @@ def test_the_packaged_estimator_is_right_on_fresh_maps(packaged):
     error = [np.abs(found.margins - margins)[..., event][near[..., event]].mean() for event in range(3)]
     assert (error < 0.15 * limits).all()
     np.testing.assert_allclose(travjax.predict(heights), found.probability, atol=1e-6)
+
+
+def test_the_packaged_estimator_has_a_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    named, usual = Predictor.load("field_seekur_jr"), Predictor.load()
+    assert named.source == usual.source and named.run.setup == usual.run.setup
+    (tmp_path / "field_seekur_jr").mkdir()
+    with pytest.raises(InputError, match="field_seekur_jr"):
+        Predictor.load("field_seekur_jr")  # a folder of that name comes first

@@ -52,8 +52,9 @@ def add(commands: options.Commands) -> None:
         "--estimator",
         type=user_path,
         metavar="FILE",
-        help="judge motions by this hazard field, a .safetensors file or the folder of a run, instead of margins: its "
-        "probability is the risk, and above --threshold it forbids a motion; for noisy maps",
+        help="judge motions by this hazard field instead of margins: a .safetensors file, the folder of a run, or "
+        "field_seekur_jr, which comes with travjax; its probability is the risk, and above --threshold it forbids a "
+        "motion; for noisy maps",
     )
     parser.add_argument(
         "--threshold", type=float, default=0.5, metavar="P", help="probability of failure that is too much (0.5)"

@@ -58,12 +58,16 @@ class Predictor:
     @staticmethod
     @usual_flags()
     def load(source: str | Path | None = None, which: str = "best") -> "Predictor":
-        """Loads the estimator of a file, of a training run's folder, or the one that comes with the package.
+        """Loads the estimator of a file, of a training run's folder, or one that comes with the package.
 
-        which: checkpoint of a folder
+        source: file or folder, or the name of one in the package, field_seekur_jr, which is also meant by None
+        which:  checkpoint of a folder
         Raises InputError when there is none, or it is damaged.
         """
-        path = WEIGHTS / f"{DEFAULT}{SUFFIX}" if source is None else user_path(source)
+        path = user_path(DEFAULT if source is None else source)
+        packaged = WEIGHTS / f"{path.name}{SUFFIX}"
+        if len(path.parts) == 1 and packaged.is_file() and not path.exists():
+            path = packaged
         if path.is_dir():
             return Predictor(*load_estimator(path, which)[:2], path)
         if path.suffix != SUFFIX:
