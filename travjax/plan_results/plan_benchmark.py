@@ -53,7 +53,8 @@ def _row(ground: ArrayGround, robot: Robot | str, contact: str, size: float) -> 
     _planned(ground, robot, contact, size, 0)  # compiles
     times = [_planned(ground, robot, contact, size, task) for task in range(1, TASKS + 1)]
     middle = {name: median(one[name] for one in times) for name in times[0]}
-    row = {"what": contact, "size_m": size} | {name: round(value, 3) for name, value in middle.items()}
+    row: dict[str, Any] = {"what": contact, "size_m": size, "to_go_s": None}
+    row |= {name: round(value, 3) for name, value in middle.items()}
     if size == min(SIZES):
         planner = Planner(ground, robot, contact=contact)
         start = time.perf_counter()
