@@ -230,6 +230,12 @@ def test_the_cost_to_go_answers_every_start():
     assert to_go.direction[26, 4] == pytest.approx(3 * math.pi / 2)  # east, straight to the goal
 
 
+def test_the_cost_to_go_leads_on_where_point_turns_cost_nothing():
+    to_go = CostToGo(planner(plane(), motions=Motions(turning=0.0, reverse=True)), (4.0, 4.0))
+    row, col = np.array([(16, 8), (24, 16), (16, 24), (8, 16)]).T  # west, north, east, south of the goal
+    np.testing.assert_allclose(to_go.direction[row, col], np.radians([270, 180, 90, 0]), atol=1e-9)
+
+
 def test_no_path_in_the_cost_to_go_is_an_error_like_that_of_a_plan():
     to_go = CostToGo(planner(walled(gap=0)), GOAL)
     with pytest.raises(NoPathError, match="no path from start"):

@@ -50,12 +50,21 @@ class CostToGo:
 
     @property
     def direction(self) -> Float[np.ndarray, "rows cols"]:
-        """Where the cheapest path from every place leads: radians, anticlockwise from +y; NaN where there is none."""
+        """Where the cheapest path from every place leads: radians, anticlockwise from +y; NaN where there is none.
+
+        It is where its first drive leads, after point turns, which may cost nothing.
+        """
         lattice, moves = self.planner.lattice, self._search.moves
         heading = self.by_heading.argmin(axis=-1)
-        states = np.arange(heading.size).reshape(heading.shape) * lattice.headings + heading
-        arrived = self._search.arrived[states]
-        backwards = np.append(moves.backwards, 0)[np.where(arrived == NOWHERE, -1, arrived.astype(int))]
+        first = np.arange(heading.size).reshape(heading.shape) * lattice.headings
+        while True:
+            arrived = self._search.arrived[first + heading].astype(int)
+            arrived[arrived == NOWHERE] = -1
+            turning = np.append(moves.motion, -1)[arrived] >= len(lattice.drives)
+            if not turning.any():
+                break
+            heading = np.where(turning, arrived // moves.motion.shape[1], heading)
+        backwards = np.append(moves.backwards, False)[arrived]
         return np.where(np.isfinite(self.best), (lattice.angles[heading] + np.pi * backwards) % (2 * np.pi), np.nan)
 
     def plan(self, start: Any, coordinates: str = "site") -> Plan:
