@@ -15,7 +15,6 @@ from travjax.planning.no_path import NoPathError
 from travjax.planning.path import Path
 from travjax.planning.planner import Plan, Planner
 from travjax.planning.to_go import CostToGo
-from travjax.simulation.events import EVENTS
 from travjax.simulation.robot import Robot
 from travjax.site.geotiff import Frame
 from travjax.site.site_figures import (
@@ -38,6 +37,9 @@ ROUND = 4.0
 
 ARROWS = 28
 """Arrows along an edge of the map of the cost to go."""
+
+STYLES = ("-", "--", ":", "-.")
+"""Lines of the events in profiles."""
 
 
 def plan_figure(plan: Plan, planner: Planner, what: Sequence[str]) -> Figure:
@@ -63,7 +65,7 @@ def plan_figure(plan: Plan, planner: Planner, what: Sequence[str]) -> Figure:
 
 def no_path_figure(error: NoPathError, planner: Planner, what: Sequence[str]) -> Figure:
     """Draws the places that the search reached, and what stands in the way around them."""
-    costs, reached, events = planner.costs, error.reached, planner.setup.robot.event_names
+    reached, events = error.reached, planner.setup.robot.event_names
     heights, frame = _ground(planner)
     every = shown_every(heights.shape)
     figure, ax, side = map_figure(heights, frame, what)
@@ -78,7 +80,6 @@ def no_path_figure(error: NoPathError, planner: Planner, what: Sequence[str]) ->
     ax.plot(x, y, "x", color="black", markersize=9, markeredgewidth=2)
     ax.annotate("nearest", (x, y), textcoords="offset points", xytext=(6, 6), fontsize=8)
     draw_legend(side, dict(zip(names[1:], colours[1:], strict=True)), "reached, or in the way")
-    assert costs.shape == reached.places.shape
     return figure
 
 
@@ -159,15 +160,13 @@ def _draw_elevation(ax, path: Path) -> None:
 
 def _draw_margins(ax, path: Path, robot: Robot) -> None:
     """Draws the margins as shares of their limits; the limit is one line for all."""
-    values = {name: getattr(path, name) for name in EVENTS}
-    styles = ("-", "--", ":")
-    limits = dict(zip(robot.event_names, robot.limits, strict=True))
-    for (name, value), style, colour in zip(values.items(), styles, EVENT_COLOURS[1:], strict=False):
-        ax.plot(path.distance, value / limits[name], style, color=colour, linewidth=1.6, label=name)
+    shares = [getattr(path, name) / limit for name, limit in zip(robot.event_names, robot.limits, strict=True)]
+    for name, share, style, colour in zip(robot.event_names, shares, STYLES, EVENT_COLOURS[1:], strict=False):
+        ax.plot(path.distance, share, style, color=colour, linewidth=1.6, label=name)
     ax.axhline(1, color="black", linewidth=1.5)
     ax.text(0.99, 1.01, "limit", transform=ax.get_yaxis_transform(), ha="right", va="bottom", fontsize=8)
-    top = max([1.0, *(float(np.nanmax(value / limits[name], initial=0)) for name, value in values.items())])
-    ax.set(xlabel="distance along the path [m]", ylabel="margin / limit", ylim=(min(0, -0.02), top * 1.12))
+    top = max(1.0, *(float(np.nanmax(share, initial=0)) for share in shares))
+    ax.set(xlabel="distance along the path [m]", ylabel="margin / limit", ylim=(-0.02, top * 1.12))
     ax.set_title("margins, by the sequential simulator")
-    ax.legend(fontsize=8, ncols=3, loc="upper left")
+    ax.legend(fontsize=8, ncols=len(shares), loc="upper left")
     ax.grid(alpha=0.3)

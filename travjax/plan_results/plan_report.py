@@ -1,5 +1,6 @@
 """Plans on disk: tables, files for other tools and figures, in one folder."""
 
+from collections.abc import Sequence
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -14,28 +15,34 @@ from travjax.plan_results.plan_figures import no_path_figure, plan_figure, to_go
 from travjax.planning.no_path import NoPathError
 from travjax.planning.planner import Plan, Planner
 from travjax.planning.to_go import CostToGo
-from travjax.simulation.events import EVENTS
+from travjax.simulation.events import Event
 from travjax.site.geotiff import Frame, save_geotiff
+
+PLAN_FILES = ("path.csv", "path.geojson", "path.gpx", "plan.png", "plan.txt")
+"""Files that only a folder with a path holds."""
+
+NO_PATH_FILES = ("no_path.png", "no_path.txt")
+"""Files that only a folder without a path holds."""
 
 
 def save_plan(plan: Plan, planner: Planner, out: str | FilePath, ros_path: FilePath | None = None) -> FilePath:
     """Writes a plan's files and figure into a folder, prints what the plan is, and returns the folder.
 
+    The files of an earlier `save_no_path` are removed.
     ros_path: file, .mcap or .db3, that gets the path as nav_msgs/Path as well
     Raises InputError when something cannot be written.
     """
     path, robot = plan.path, planner.setup.robot
-    limits = dict(zip(robot.event_names, robot.limits, strict=True))
-    largest = {name: float(np.nanmax(getattr(path, name), initial=0)) for name in EVENTS}
-    rows = [
-        {"event": name, "largest margin": _shown(name, largest[name]), "limit": _shown(name, limits[name])}
-        for name in EVENTS
-    ]
+    rows = []
+    for event, limit in zip(robot.events, robot.limits, strict=True):
+        largest = float(np.nanmax(getattr(path, event.name), initial=0))
+        rows.append({"event": event.name, "largest margin": _shown(event, largest), "limit": _shown(event, limit)})
     lines = [_heading(planner), f"path of {path.length:.2f} m, cost {plan.cost:.2f}", rows_table(rows)]
     lines += [f"{what}: {count}" for what, count in plan.checks.items()]
     progress.say("\n".join(lines))
     with held(folder := output_folder(out)):
         figure = plan_figure(plan, planner, (lines[0], lines[1]))
+        _remove(folder, NO_PATH_FILES)
         written, notes = path_files.save_path(folder, plan, planner)
         written.append(map_figures.save(figure, folder / "plan.png"))
         written.append(save_text(folder / "plan.txt", "\n".join(lines) + "\n"))
@@ -48,16 +55,19 @@ def save_plan(plan: Plan, planner: Planner, out: str | FilePath, ros_path: FileP
 
 
 def save_no_path(error: NoPathError, planner: Planner, out: str | FilePath) -> FilePath:
-    """Writes no_path.png and no_path.txt, prints the reason, and returns the folder."""
+    """Writes no_path.png and no_path.txt, prints the reason, and returns the folder.
+
+    The files of an earlier `save_plan` are removed.
+    Raises InputError when something cannot be written.
+    """
     progress.say(one_line(error))
     with held(folder := output_folder(out)):
         figure = no_path_figure(
             error, planner, (_heading(planner), f"no path from {error.start.name} to {error.goal.name}")
         )
-        written = [
-            map_figures.save(figure, folder / "no_path.png"),
-            save_text(folder / "no_path.txt", f"{error}\n"),
-        ]
+        _remove(folder, PLAN_FILES)
+        image, text = NO_PATH_FILES
+        written = [map_figures.save(figure, folder / image), save_text(folder / text, f"{error}\n")]
     progress.wrote(*written)
     return folder
 
@@ -83,10 +93,16 @@ def save_to_go(to_go: CostToGo, out: str | FilePath) -> FilePath:
     return folder
 
 
+def _remove(folder: FilePath, names: Sequence[str]) -> None:
+    """Removes what an earlier plan left behind, which nobody should take for the result of this one."""
+    for name in names:
+        (folder / name).unlink(missing_ok=True)
+
+
 def _heading(planner: Planner) -> str:
     setup, lattice = planner.setup, planner.lattice
     return f"{setup.robot.name}, {setup.contact}, {lattice.headings} headings, places {lattice.stride:g} m apart"
 
 
-def _shown(event: str, margin: float) -> str:
-    return f"{np.degrees(margin):.1f} deg" if event == "tilt" else f"{margin:.3f} m"
+def _shown(event: Event, margin: float) -> str:
+    return f"{np.degrees(margin):.1f} deg" if event.unit == "rad" else f"{margin:.3f} m"

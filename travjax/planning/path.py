@@ -89,10 +89,11 @@ class Path:
     """A path, as the sequential simulators see it; p poses.
 
     pose:     [p, 3] x, y in metres, in coordinates of the site, and heading in radians from 0 to 2 pi
-    z:        [p] metres, height of the pose plane's centre; NaN on unknown ground, as the next three
+    z:        [p] metres, height of the pose plane's centre; NaN on unknown ground, as the margins
     distance: [p] metres from its beginning, along the path
     motion:   [p] names of the motion that leads to each pose
-    step, obstacle, tilt: [p] metres and radians; step is that from the pose before, 0 at the first one and in turns
+    step, obstacle, tilt, roll: [p] metres and radians; step is that from the pose before, 0 at the first one and in
+              turns; roll counts to both sides
     known:    [p] whether all ground that is touched is known
     share:    [p] the largest margin as a share of its limit, of all events of the robot; NaN on unknown ground. It
               includes, of `tyre`, the step that tyres reach where a drive begins
@@ -106,13 +107,14 @@ class Path:
     step: Float[np.ndarray, " p"]
     obstacle: Float[np.ndarray, " p"]
     tilt: Float[np.ndarray, " p"]
+    roll: Float[np.ndarray, " p"]
     known: Bool[np.ndarray, " p"]
     share: Float[np.ndarray, " p"]
     exceeds: Bool[np.ndarray, " p"]
 
     @property
     def length(self) -> float:
-        """Metres of its beginning to its end."""
+        """The metres from its beginning to its end."""
         return float(self.distance[-1])
 
 
@@ -134,8 +136,9 @@ def drive(
     turning = np.array([legs[number].turning for number in owner] if legs else [True])
     seen = list(_simulated(poses, ground, setup))
     step, obstacle, tilt, roll, known, z = (np.concatenate(field) for field in zip(*seen, strict=True))
-    values = {"step": np.where(_counts(turning, setup.contact), step, 0), "obstacle": obstacle, "tilt": tilt}
-    values["roll"] = np.abs(roll)
+    roll = np.abs(roll)
+    counted = np.where(_counts(turning, setup.contact), step, 0)
+    values = {"step": counted, "obstacle": obstacle, "tilt": tilt, "roll": roll}
     step = np.where(turning & known, 0, step)
     step[0] = np.where(known[0], 0, np.nan)
     robot = setup.robot
@@ -147,7 +150,8 @@ def drive(
     pose[:, 2] %= 2 * math.pi
     distance = _arc_lengths(poses, along)
     exceeds = share > 1 + TOLERANCE
-    return Path(pose, z + ground.height_offset, distance, names, step, obstacle, tilt, known, share, exceeds), owner
+    z = z + ground.height_offset
+    return Path(pose, z, distance, names, step, obstacle, tilt, roll, known, share, exceeds), owner
 
 
 def _counts(turning: Bool[np.ndarray, " p"], contact: str) -> Bool[np.ndarray, " p"]:
