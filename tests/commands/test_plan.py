@@ -52,6 +52,7 @@ def test_without_a_path_the_exit_code_is_1_and_the_reason_is_drawn(site, tmp_pat
         (("--to", 1002, 2006), "--from = None: must be given, unless --to-go is"),
         (("--from", 1002, "--to", 1002, 2006), "--from = [1002.0]: must be X Y, or X Y DEG with the heading"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--unknown-cost", 0.5), "unknown_cost = 0.5: must be a factor of"),
+        (("--from", 1002, 2001, "--to", 1002, 2006, "--threshold", 0), "--threshold = '0.0': must be left out without"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--coordinates", "latlon"), "x and y, since the site has no"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--primitives", "none.toml"), "none.toml: cannot be read"),
     ],

@@ -34,9 +34,7 @@ def add(commands: options.Commands) -> None:
     where = "x and y of the site, and the heading in degrees anticlockwise from +y (north) if it matters"
     parser.add_argument("--from", dest="start", help=f"where the path begins: {where}", **numbers)
     parser.add_argument("--to", dest="goal", required=True, help="where it ends, likewise", **numbers)
-    parser.add_argument(
-        "--via", action="append", default=[], help="a point to pass, likewise; may be given again", **numbers
-    )
+    parser.add_argument("--via", action="append", help="a point to pass, likewise; may be given again", **numbers)
     parser.add_argument(
         "--coordinates",
         choices=("site", "latlon", "rowcol"),
@@ -57,7 +55,10 @@ def add(commands: options.Commands) -> None:
         "motion; for noisy maps",
     )
     parser.add_argument(
-        "--threshold", type=float, default=0.5, metavar="P", help="probability of failure that is too much (0.5)"
+        "--threshold",
+        type=float,
+        metavar="P",
+        help="with --estimator: probability of failure above which a motion is not used (0.5)",
     )
     parser.add_argument(
         "--interval", type=float, default=0.06, metavar="M", help="metres between simulated poses (0.06)"
@@ -103,7 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     from travjax.planning.to_go import CostToGo
     from travjax.site.mapping import say_notes
 
-    goal, via = _point("--to", arguments.goal), [_point("--via", point) for point in arguments.via]
+    goal, via = _point("--to", arguments.goal), [_point("--via", point) for point in arguments.via or ()]
     start = _point("--from", arguments.start) if arguments.start else None
     _require_together(arguments)
     site = options.site(arguments)
@@ -140,13 +141,16 @@ def _require_together(arguments: argparse.Namespace) -> None:
         by_trajectories = arguments.planner == ACTION_SPACE
         _require_left_out(arguments, name, by_trajectories, f"with --planner {ACTION_SPACE}")
     _require_left_out(arguments, "unknown_cost", arguments.estimator is not None, "with --estimator")
+    _require_left_out(arguments, "threshold", arguments.estimator is None, "without --estimator")
     if arguments.ros_path:
         require_recording("--ros-path", arguments.ros_path)
 
 
 def _require_left_out(arguments: argparse.Namespace, name: str, here: bool, where: str) -> None:
+    """Raises InputError if an option is given where it has no effect; where: in words, as in "with --estimator"."""
     given = getattr(arguments, name)
-    require(not (here and given), f"--{name.replace('_', '-')}", given and str(given), f"left out {where}")
+    none = given is None or given is False
+    require(none or not here, f"--{name.replace('_', '-')}", str(given), f"left out {where}")
 
 
 def _planner(arguments: argparse.Namespace, site: "SiteGround") -> "Planner":
@@ -159,7 +163,9 @@ def _planner(arguments: argparse.Namespace, site: "SiteGround") -> "Planner":
     judge, contact = None, arguments.contact
     if arguments.estimator:
         predictor = Predictor.load(arguments.estimator)
-        judge = partial(FieldJudge, predictor=predictor, threshold=arguments.threshold)
+        judge = partial(FieldJudge, predictor=predictor)
+        if arguments.threshold is not None:
+            judge = partial(judge, threshold=arguments.threshold)
         contact = contact or predictor.run.setup.contact.model
     return Planner(
         site,

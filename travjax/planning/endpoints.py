@@ -112,7 +112,7 @@ def why_not_standing(point: Endpoint, costs: MotionCosts) -> str:
 def _nearest(point: Endpoint, costs: MotionCosts, headings: slice) -> str:
     rows, cols = np.nonzero(np.isfinite(costs.standing[0][headings]).any(axis=0))
     if not len(rows):
-        return "it can nowhere on the site"
+        return "it can stand nowhere on the site"
     best = np.hypot(rows - point.row, cols - point.col).argmin()
     stride, origin = costs.lattice.stride, costs.ground.origin
     x, y = origin[0] + cols[best] * stride, origin[1] + rows[best] * stride

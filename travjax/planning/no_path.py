@@ -19,7 +19,7 @@ class Reached:
 
     places:   [rows, cols] that can be reached
     frontier: [rows, cols] what stands in the way to places that cannot be reached but lie next to those that can: 0 is
-              nothing, 1, 2, 3 ... the robot's event of this number, costs.UNKNOWN unknown ground
+              nothing, 1, 2, 3 ... the robot's event of this number, judges.UNKNOWN unknown ground
     nearest:  row and column of the reached place that is nearest to the goal
     """
 
