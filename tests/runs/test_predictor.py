@@ -300,3 +300,4 @@ def test_the_packaged_estimator_has_a_name(tmp_path, monkeypatch):
     (tmp_path / "field_seekur_jr").mkdir()
     with pytest.raises(InputError, match="field_seekur_jr"):
         Predictor.load("field_seekur_jr")  # a folder of that name comes first
+    assert Predictor.load().source == usual.source  # which nobody asked for here

@@ -66,7 +66,7 @@ class Predictor:
         """
         path = user_path(DEFAULT if source is None else source)
         packaged = WEIGHTS / f"{path.name}{SUFFIX}"
-        if len(path.parts) == 1 and packaged.is_file() and not path.exists():
+        if source is None or (len(path.parts) == 1 and packaged.is_file() and not path.exists()):
             path = packaged
         if path.is_dir():
             return Predictor(*load_estimator(path, which)[:2], path)
