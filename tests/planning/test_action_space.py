@@ -7,7 +7,7 @@ import pytest
 
 from tests.planning.sites import NODES, SPACING, parted, plane, walled
 from travjax.config import InputError
-from travjax.planning.action_space import ActionSpacePlanner, Search
+from travjax.planning.action_space import ActionSpacePlanner, Search, State
 from travjax.planning.no_path import NoPathError
 from travjax.planning.path import PosedLeg, drive
 from travjax.planning.planner import Planner
@@ -48,6 +48,14 @@ def test_over_a_plane_the_path_is_nearly_straight(actions, longer):
     assert found.checks["poses that exceed a limit"] == found.checks["motions refused before"] == 0
     turned = sum(leg.turned for leg in found.legs)
     assert found.cost == pytest.approx(found.path.length + 0.3 * turned, abs=1e-6)
+
+
+def test_a_path_may_have_more_states_than_python_has_stack():
+    pose, state = np.zeros(3), State(np.zeros(3))
+    legs = [PosedLeg(str(number), False, pose[None], 0.0, 0.0) for number in range(3000)]
+    for leg in legs:
+        state = State(pose, legs=(leg,), before=state)
+    assert state.path() == legs
 
 
 def test_the_path_begins_exactly_at_the_start_and_ends_near_the_goal():

@@ -43,6 +43,13 @@ def add(commands: options.Commands) -> None:
         "counted from the south-west (rowcol)",
     )
     options.add_site(parser)
+    _add_search(parser)
+    _add_files(parser)
+    parser.set_defaults(run=run)
+
+
+def _add_search(parser: argparse.ArgumentParser) -> None:
+    """Adds the options for motions, what they cost, and how a path is searched."""
     parser.add_argument(
         "--primitives", type=user_path, metavar="FILE", help=".toml file of what the robot may do and what that costs"
     )
@@ -76,6 +83,10 @@ def add(commands: options.Commands) -> None:
         help="drive over unknown ground, at K times the cost of the worst safe ground (never); what stands between "
         "unknown ground is not seen then",
     )
+
+
+def _add_files(parser: argparse.ArgumentParser) -> None:
+    """Adds the options for what is written."""
     parser.add_argument(
         "--to-go",
         action="store_true",
@@ -92,7 +103,6 @@ def add(commands: options.Commands) -> None:
         "--ros-path", type=user_path, metavar="FILE", help="also write the path as nav_msgs/Path, .mcap or .db3"
     )
     options.add_out(parser, "runs/plan")
-    parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -65,7 +65,12 @@ class State:
 
     def path(self) -> list[PosedLeg]:
         """Returns all legs of the path to it."""
-        return [*(self.before.path() if self.before else []), *self.legs]
+        legs: list[PosedLeg] = []
+        state: State | None = self
+        while state is not None:
+            legs[:0] = state.legs
+            state = state.before
+        return legs
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +201,7 @@ class Search:
     def run(self) -> tuple[Path, State] | None:
         """Searches for a path; returns it with the state where it ends, or None."""
         self._expand(State(self.start))
-        with bar("planning", self.planner.most, " trajectories", self.planner.quiet) as progress:
+        with bar("planning", self.planner.most, "trajectory", self.planner.quiet) as progress:
             while self._heap and self.tried < self.planner.most:
                 _, number, rank = heapq.heappop(self._heap)
                 ways = self._ways[number]

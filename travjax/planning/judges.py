@@ -1,7 +1,7 @@
 """Who says what motions cost from every place, and what stands in their way.
 
 A planner asks a judge. The one here knows the exact margins of the site kernel (SPEC section 13); field_judge.py has
-one that knows probabilities, and one of your own is a class with these three methods.
+one that knows probabilities, and one of your own is a class with what `Judge` has.
 """
 
 from dataclasses import replace

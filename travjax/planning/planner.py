@@ -63,7 +63,7 @@ class Planner:
         unknown_cost: float | None = None,
         judge: Callable[[Site, SiteSetup, MotionLattice], Judge] | None = None,
     ):
-        """See `plan`; judge: makes what says how good motions are, by exact margins unless given."""
+        """See `plan`; judge: makes the judge of motions, which goes by exact margins unless given."""
         chosen, spacing = chosen_robot(robot), ground.spacing
         places = SiteSetup.usual_stride(spacing) if stride is None else stride
         if unknown_cost is not None:
