@@ -129,7 +129,7 @@ def test_a_motion_that_the_sequential_simulators_refuse_is_left_out(monkeypatch)
 
 def test_no_path_leads_over_unknown_ground_unless_it_may():
     closed = planner(parted())
-    with pytest.raises(NoPathError, match="unknown ground 100%") as caught:
+    with pytest.raises(NoPathError, match="unknown ground or the site's edge 100%") as caught:
         closed.plan(START, GOAL)
     reached = caught.value.reached
     assert reached.nearest[0] * 0.25 < 4 and set(np.unique(reached.frontier)) == {0, UNKNOWN}

@@ -10,7 +10,7 @@ from matplotlib.transforms import Affine2D
 
 from travjax.evaluation.map_figures import UNKNOWN_COLOUR
 from travjax.planning.endpoints import Endpoint
-from travjax.planning.judges import UNKNOWN
+from travjax.planning.judges import UNKNOWN, UNKNOWN_NAME
 from travjax.planning.no_path import NoPathError
 from travjax.planning.path import Path
 from travjax.planning.planner import Plan, Planner
@@ -70,7 +70,7 @@ def no_path_figure(error: NoPathError, planner: Planner, what: Sequence[str]) ->
     every = shown_every(heights.shape)
     figure, ax, side = map_figure(heights, frame, what)
     colours = (ELSEWHERE, REACHED, *EVENT_COLOURS[1 : len(events) + 1], UNKNOWN_COLOUR)
-    names = ("", "can be reached", *events, "unknown ground")
+    names = ("", "can be reached", *events, UNKNOWN_NAME.replace(" or ", "\nor "))
     kinds = np.where(reached.frontier > 0, reached.frontier.astype(int) + 1, reached.places)
     kinds[reached.frontier == UNKNOWN] = len(names) - 1
     draw_kinds(ax, heights, _thinned(kinds[::-1], every), colours, frame, every)

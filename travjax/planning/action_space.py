@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Int
 
 from travjax.config import InputError, require, require_number, shown
 from travjax.planning.endpoints import Endpoint, endpoint, on_site, place_text, standing, why_not_standing
+from travjax.planning.judges import UNKNOWN_NAME
 from travjax.planning.motions import TURN_PART
 from travjax.planning.no_path import NoPathError, Reached, no_path, reached_places, standing_beside
 from travjax.planning.path import Path, PosedLeg, drive
@@ -159,11 +160,9 @@ class ActionSpacePlanner:
         x, y = (
             value + place * self.site.stride for value, place in zip(self.costs.ground.origin, (col, row), strict=True)
         )
-        ended = (
-            f"gave up after {search.tried} trajectories"
-            if search.tried >= self.most
-            else "nothing is left to go on from"
-        )
+        ended = "nothing is left to go on from"
+        if search.tried >= self.most:
+            ended = f"gave up after {search.tried} trajectories"
         failed = {name: count for name, count in search.failed.items() if count}
         shares = [f"{name} {failed[name] / search.labelled:.0%}" for name in sorted(failed, key=lambda k: -failed[k])]
         text = (
@@ -187,7 +186,7 @@ class Search:
         self.ground, self.setup, self.actions = planner.costs.ground, planner.site, planner.actions
         self.headings = self.actions.heading(np.arange(self.actions.turns))
         self.tried = self.refused = self.labelled = 0
-        self.failed = dict.fromkeys((*self.setup.robot.event_names, "unknown ground"), 0)
+        self.failed = dict.fromkeys((*self.setup.robot.event_names, UNKNOWN_NAME), 0)
         self._places = np.zeros(planner.costs.shape, bool)
         self._mark(start[None])
         self._closed: set[int] = set()

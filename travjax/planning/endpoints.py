@@ -11,7 +11,7 @@ from pyproj.exceptions import ProjError
 
 from travjax.config import InputError, require, require_number, shown
 from travjax.planning.costs import MotionCosts
-from travjax.planning.judges import UNKNOWN
+from travjax.planning.judges import UNKNOWN, UNKNOWN_NAME
 from travjax.rasters.coordinates import is_local, parsed
 from travjax.site.ground import Site
 
@@ -126,4 +126,4 @@ def place_text(x: float, y: float) -> str:
 
 def in_the_way_named(code: int, costs: MotionCosts) -> str:
     """Returns what a code of MotionCosts.in_the_way stands for."""
-    return "unknown ground" if code == UNKNOWN else costs.robot.event_names[code - 1]
+    return UNKNOWN_NAME if code == UNKNOWN else costs.robot.event_names[code - 1]

@@ -19,6 +19,9 @@ from travjax.site.primitives import PointTurn
 UNKNOWN = 255
 """Stands for unknown ground among what stands in the way; 0 is nothing, 1 the robot's first event."""
 
+UNKNOWN_NAME = "unknown ground or the site's edge"
+"""What messages and figures call it: ground beyond the site is unknown, too."""
+
 Judged = tuple[Float32[np.ndarray, "m rows cols"], UInt8[np.ndarray, "m rows cols"]]
 """Factors of the cost of motions from places, inf where they are impossible, and what is in their way there."""
 
