@@ -53,6 +53,7 @@ def test_without_a_path_the_exit_code_is_1_and_the_reason_is_drawn(site, tmp_pat
         (("--from", 1002, "--to", 1002, 2006), "--from = [1002.0]: must be X Y, or X Y DEG with the heading"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--unknown-cost", 0.5), "unknown_cost = 0.5: must be a factor of"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--threshold", 0), "--threshold = '0.0': must be left out without"),
+        (("--from", 1002, 2001, "--to", 1002, 2006, "--route-graph", "none/graph.geojson"), "--route-graph = 'none/gr"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--coordinates", "latlon"), "x and y, since the site has no"),
         (("--from", 1002, 2001, "--to", 1002, 2006, "--primitives", "none.toml"), "none.toml: cannot be read"),
     ],
@@ -61,6 +62,11 @@ def test_bad_input_is_one_line_and_exit_code_2(site, tmp_path, words, line):
     code, _, err = run_words("plan", site, *words, *QUICK, "--out", tmp_path / "out")
     assert code == 2 and line in err and err.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_in_place_of_the_folder_is_refused_before_anything_is_planned(site):
+    code, text, err = run_words("plan", site, "--from", 1002, 2001, "--to", 1002, 2006, *QUICK, "--out", site)
+    assert (code, text, err) == (2, "", f"travjax: --out = {str(site)!r}: must be a folder\n")
 
 
 def test_primitives_are_read_from_a_file(site, tmp_path):

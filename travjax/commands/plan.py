@@ -141,7 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _require_together(arguments: argparse.Namespace) -> None:
-    """Raises InputError where options do not go together, or a recording could not be written."""
+    """Raises InputError where options do not go together, or results could not be written in the end."""
     from travjax.rasters.recordings import require_recording
 
     require(bool(arguments.start or arguments.to_go), "--from", None, "given, unless --to-go is")
@@ -152,6 +152,12 @@ def _require_together(arguments: argparse.Namespace) -> None:
         _require_left_out(arguments, name, by_trajectories, f"with --planner {ACTION_SPACE}")
     _require_left_out(arguments, "unknown_cost", arguments.estimator is not None, "with --estimator")
     _require_left_out(arguments, "threshold", arguments.estimator is None, "without --estimator")
+    out, graph = arguments.out, arguments.route_graph
+    require(out.is_dir() or not out.exists(), "--out", str(out), "a folder")
+    if graph:
+        require(
+            graph.parent.is_dir() and not graph.is_dir(), "--route-graph", str(graph), "a file in a folder that exists"
+        )
     if arguments.ros_path:
         require_recording("--ros-path", arguments.ros_path)
 
