@@ -1,9 +1,12 @@
-"""`travjax bench --plan`: a row for each size and contact model."""
+"""`travjax bench --plan`: a row for each size and contact model, and an end where a motion is refused."""
 
 import csv
 
+from tests.planning.sites import SPACING, plane
 from travjax.plan_results import plan_benchmark
+from travjax.planning import planner
 from travjax.simulation.contact import CONTACTS
+from travjax.site.ground import ArrayGround
 
 
 def test_there_is_a_row_for_every_size_and_contact_model(tmp_path, monkeypatch, capsys):
@@ -19,3 +22,18 @@ def test_there_is_a_row_for_every_size_and_contact_model(tmp_path, monkeypatch, 
         assert float(row["path_s"]) > 0 and float(row["check_s"]) > 0 and int(row["peak_mib"]) > 100
     assert float(rows[0]["to_go_s"]) > 0 and not rows[1]["to_go_s"]
     assert str(tmp_path / "plan.tsv") in capsys.readouterr().out
+
+
+def test_a_motion_that_the_simulators_refuse_is_replaced(monkeypatch):
+    drive, paths = planner.drive, []
+
+    def refusing(*arguments):
+        path, owner = drive(*arguments)
+        path.exceeds[3] = not paths
+        paths.append(path)
+        return path, owner
+
+    monkeypatch.setattr(planner, "drive", refusing)
+    ground = ArrayGround(plane().astype("float32"), 0.0, SPACING)
+    took = plan_benchmark._planned(ground, "seekur_jr", "nearest", 8.0, 0)
+    assert len(paths) == 2 and took["length_m"] == paths[1].length
