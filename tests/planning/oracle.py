@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from travjax.data.sensor_noise import filled
 from travjax.planning.motions import Motion, MotionLattice
 from travjax.planning.path import Leg, Path
 from travjax.planning.planner import Plan, Planner
@@ -82,6 +83,8 @@ class Exhaustive:
         rows, cols = ground.shape
         heights = ground.part(slice(0, rows), slice(0, cols))
         self.simulated = Simulated(heights, setup.robot, setup.spacing, setup.contact)
+        assumed = filled(heights[None])[0]  # unknown ground is as high as the nearest known
+        self.assumed = Simulated(assumed, setup.robot, setup.spacing, setup.contact)
         self._factors: dict[tuple[int, int, int], float] = {}
 
     def cost(self, number: int, row: int, col: int) -> float:
@@ -103,12 +106,18 @@ class Exhaustive:
                 if self.unknown_cost is None:
                     return math.inf
                 continue
-            for event, limit in zip(self.robot.events, self.robot.limits, strict=True):
-                if not (turning and event.name == "step"):
-                    largest = max(largest, margins[event.name] / limit)
+            largest = max(largest, self._share(margins, turning))
             if largest > 1:
                 return math.inf
-        return self.unknown_cost * (1 + risk) if unknown else 1 + risk * largest**2
+        if not unknown:
+            return 1 + risk * largest**2
+        then = self.assumed.margins(poses)
+        possible = all(margins is not None and self._share(margins, turning) <= 1 for margins in then)
+        return self.unknown_cost * (1 + risk) if possible else math.inf
+
+    def _share(self, margins: dict[str, float], turning: bool) -> float:
+        events = zip(self.robot.events, self.robot.limits, strict=True)
+        return max(margins[event.name] / limit for event, limit in events if not (turning and event.name == "step"))
 
     @cached_property
     def steps(self) -> list[list[tuple[int, int, int, int, int, int, float]]]:

@@ -242,3 +242,12 @@ def test_no_path_in_the_cost_to_go_is_an_error_like_that_of_a_plan():
         to_go.plan(START)
     with pytest.raises(NoPathError, match="goal = .*cannot stand there"):
         CostToGo(planner(walled()), (2.0, 4.0))
+
+
+def test_unknown_ground_hides_no_wall_and_no_edge_of_the_site():
+    hidden = walled(gap=0)
+    hidden[27:31] = hidden[34:38] = np.nan  # the wall in the shadow of its own scan
+    with pytest.raises(NoPathError, match="obstacle|step|tilt"):
+        planner(hidden, unknown_cost=1.0).plan(START, GOAL)
+    with pytest.raises(NoPathError):  # not around it either, half off the site
+        planner(walled(gap=0), unknown_cost=1.0).plan(START, GOAL)

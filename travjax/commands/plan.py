@@ -80,8 +80,8 @@ def _add_search(parser: argparse.ArgumentParser) -> None:
         "--unknown-cost",
         type=float,
         metavar="K",
-        help="drive over unknown ground, at K times the cost of the worst safe ground (never); what stands between "
-        "unknown ground is not seen then",
+        help="drive over unknown ground, at K times the cost of the worst safe ground (never); it is then "
+        "taken to be as high as the nearest known ground",
     )
 
 

@@ -79,9 +79,10 @@ def route_graph(planner: Planner, spacing: float | None = None) -> RouteGraph:
     lengths = [spacing * math.hypot(*direction) for direction in DIRECTIONS]
     drives = tuple(Primitive(angle, ((math.inf, length),)) for angle, length in zip(angles, lengths, strict=True))
     judge = MarginJudge(ground, setup, lattice, planner.unknown_cost)  # whatever that of the planner is
-    ahead, _ = judge.judged(site_margins(ground, replace(nodes, primitives=drives)), turning=False)
+    straight = replace(nodes, primitives=drives)
+    ahead, _ = judge.judged(lambda heights: site_margins(heights, straight), turning=False)
     turns = replace(nodes, primitives=tuple(turn.primitive for turn in lattice.point_turns))
-    around, _ = judge.judged(site_margins(ground, turns), turning=True)
+    around, _ = judge.judged(lambda heights: site_margins(heights, turns), turning=True)
     place = np.full(around.shape[1:], -1)  # number of the node there
     rows, cols = np.nonzero(np.isfinite(around).all(axis=0))
     place[rows, cols] = np.arange(len(rows))
