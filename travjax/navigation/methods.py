@@ -31,6 +31,7 @@ class GeometricJudge:
     """
 
     unknown_allowed = False
+    title = "geometric cost map"
     final = False
 
     def __init__(self, ground: Site, setup: SiteSetup, lattice: MotionLattice):

@@ -37,7 +37,7 @@ def save_plan(plan: Plan, planner: Planner, out: str | FilePath, ros_path: FileP
     for event, limit in zip(robot.events, robot.limits, strict=True):
         largest = float(np.nanmax(getattr(path, event.name), initial=0))
         rows.append({"event": event.name, "largest margin": _shown(event, largest), "limit": _shown(event, limit)})
-    lines = [_heading(planner), f"path of {path.length:.2f} m, cost {plan.cost:.2f}", rows_table(rows)]
+    lines = [_heading(planner, plan.found_by), f"path of {path.length:.2f} m, cost {plan.cost:.2f}", rows_table(rows)]
     lines += [f"{what}: {count}" for what, count in plan.checks.items()]
     progress.say("\n".join(lines))
     with held(folder := output_folder(out)):
@@ -63,7 +63,7 @@ def save_no_path(error: NoPathError, planner: Planner, out: str | FilePath) -> F
     progress.say(one_line(error))
     with held(folder := output_folder(out)):
         figure = no_path_figure(
-            error, planner, (_heading(planner), f"no path from {error.start.name} to {error.goal.name}")
+            error, planner, (_heading(planner, planner.method), f"no path from {error.start.name} to {error.goal.name}")
         )
         _remove(folder, PLAN_FILES)
         image, text = NO_PATH_FILES
@@ -76,7 +76,7 @@ def save_to_go(to_go: CostToGo, out: str | FilePath) -> FilePath:
     """Writes to_go.tif and to_go.png, and returns the folder."""
     planner, best = to_go.planner, to_go.best
     goal, reached = to_go.goal, np.isfinite(best)
-    heading = f"{_heading(planner)}\ncost to go to ({goal.x:.2f}, {goal.y:.2f}): from {reached.mean():.1%} of places"
+    heading = f"{_heading(planner, planner.method)}\ncost to go to ({goal.x:.2f}, {goal.y:.2f}): from {reached.mean():.1%} of places"
     progress.say(heading)
     ground, setup = planner.costs.ground, planner.setup
     bands = np.stack([np.where(reached, best, np.nan), np.degrees(to_go.direction)]).astype(np.float32)[:, ::-1]
@@ -99,9 +99,8 @@ def _remove(folder: FilePath, names: Sequence[str]) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _heading(planner: Planner) -> str:
-    setup, lattice = planner.setup, planner.lattice
-    return f"{setup.robot.name}, {setup.contact}, {lattice.headings} headings, places {lattice.stride:g} m apart"
+def _heading(planner: Planner, method: str) -> str:
+    return f"{planner.setup.robot.name}, {planner.setup.contact}, {method}"
 
 
 def _shown(event: Event, margin: float) -> str:

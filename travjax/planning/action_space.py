@@ -142,7 +142,8 @@ class ActionSpacePlanner:
             "poses on unknown ground": int((~path.known).sum()),
             "motions refused before": search.refused,
         }
-        return Plan(path, tuple(state.path()), state.cost, points, checks)
+        method = f"{len(self.actions)} trajectories from each state"
+        return Plan(path, tuple(state.path()), state.cost, points, method, checks)
 
     def _point(self, name: str, given: Any, coordinates: str) -> Endpoint:
         """Returns a point, exactly where it was given."""

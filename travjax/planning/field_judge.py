@@ -41,6 +41,7 @@ class FieldJudge:
     """
 
     unknown_allowed = False
+    title = "hazard field"
     final = False  # a map may be noisy, and the sequential simulators take noise for ground
 
     def __init__(

@@ -31,6 +31,9 @@ Judged = tuple[Float32[np.ndarray, "m rows cols"], UInt8[np.ndarray, "m rows col
 class Judge(Protocol):
     """Says what motions cost, and why some are impossible."""
 
+    title: str
+    """What figures call it."""
+
     final: bool
     """Whether a path must pass the sequential simulators in the end, because the judge wants the same as they do."""
 
@@ -55,6 +58,7 @@ class MarginJudge:
     unknown patches still is one. What leaves the site stays impossible.
     """
 
+    title = "exact margins"
     final = True
 
     def __init__(self, ground: Site, setup: SiteSetup, lattice: MotionLattice, unknown_cost: float | None = None):

@@ -36,6 +36,7 @@ class Plan:
     legs:   the motions that it is made of
     cost:   as of Motions, the least that these motions allow
     points: where it begins, passes and ends, on the lattice
+    found_by: what was searched, and what judged it
     checks: what the sequential simulators said: poses simulated, poses that exceed a limit, poses on unknown ground,
             and motions that were refused before
     """
@@ -44,6 +45,7 @@ class Plan:
     legs: tuple[Stretch, ...]
     cost: float
     points: tuple[Endpoint, ...]
+    found_by: str
     checks: Mapping[str, int]
 
 
@@ -80,6 +82,12 @@ class Planner:
     def lattice(self) -> MotionLattice:
         """States and motions."""
         return self.costs.lattice
+
+    @property
+    def method(self) -> str:
+        """What figures say of it: what is searched, and what judges it."""
+        lattice = self.lattice
+        return f"{lattice.headings} headings, places {lattice.stride:g} m apart, {self.costs.judge.title}"
 
     @usual_flags()
     def plan(self, start: Any, goal: Any, via: Sequence[Any] = (), coordinates: str = "site") -> Plan:
@@ -119,7 +127,7 @@ class Planner:
             "poses on unknown ground": int((~path.known).sum()),
             "motions refused before": self.costs.refused - before,
         }
-        return Plan(path, tuple(legs), cost, tuple(points), checks)
+        return Plan(path, tuple(legs), cost, tuple(points), self.method, checks)
 
     def cheapest(self, points: Sequence[Endpoint]) -> Found:
         """Returns the motions of the cheapest path, its cost, and the state where it begins."""
