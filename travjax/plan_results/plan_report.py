@@ -76,7 +76,8 @@ def save_to_go(to_go: CostToGo, out: str | FilePath) -> FilePath:
     """Writes to_go.tif and to_go.png, and returns the folder."""
     planner, best = to_go.planner, to_go.best
     goal, reached = to_go.goal, np.isfinite(best)
-    heading = f"{_heading(planner, planner.method)}\ncost to go to ({goal.x:.2f}, {goal.y:.2f}): from {reached.mean():.1%} of places"
+    where = f"cost to go to ({goal.x:.2f}, {goal.y:.2f}): from {reached.mean():.1%} of places"
+    heading = f"{_heading(planner, planner.method)}\n{where}"
     progress.say(heading)
     ground, setup = planner.costs.ground, planner.setup
     bands = np.stack([np.where(reached, best, np.nan), np.degrees(to_go.direction)]).astype(np.float32)[:, ::-1]
