@@ -121,9 +121,12 @@ from travjax.data.provenance import SitesConfig
 from travjax.experiments.physics import PhysicsExperiment
 from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
+from travjax.navigation.tasks import NavigationConfig
 from travjax.estimators.preset import Preset
 
-kinds = {{"physics": PhysicsExperiment, "sites": SitesConfig, "transfer": TransferConfig}}
+kinds = {{"physics": PhysicsExperiment, "sites": SitesConfig, "transfer": TransferConfig}} | {{
+    "navigation": NavigationConfig
+}}
 for kind, name in {names}:
     path = find_preset(name, kind)
     assert path.is_relative_to({str(installed.parent)!r}), path

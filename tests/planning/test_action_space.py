@@ -77,9 +77,8 @@ def test_poses_follow_each_other_without_a_jump():
     assert path.distance[-1] == pytest.approx(away.sum(), rel=1e-3)
 
 
-@pytest.mark.parametrize("contact", ["nearest", "tyre"])
-def test_the_path_leads_around_a_wall_and_each_pose_is_safe(contact):
-    found = planner(SHORT_WALL, contact=contact).plan(*AROUND)
+def test_the_path_leads_around_a_wall_and_each_pose_is_safe():
+    found = planner(SHORT_WALL).plan(*AROUND)
     x, y = found.path.pose[:, :2].T - np.reshape(ORIGIN, (2, 1))
     assert (x[(y > 3.5) & (y < 4.5)] > 3.5).all()
     assert not found.path.exceeds.any() and found.path.known.all() and found.path.share.max() <= 1

@@ -48,14 +48,18 @@ def test_probabilities_are_those_of_the_network_at_the_poses(planner, predictor)
     channels = predictor.network.trunk(elevation, False)
     odd = count + 1 - count % 2
     window = Setup(setup.robot, ActionSpace(), Grid((odd - 1) * setup.spacing, setup.spacing))
-    for number, (row, col) in zip((0, 5, 9, 13), ((0, 0), (3, 5), (7, 2), (4, 4)), strict=True):
+    where = dict(zip((0, 5, 9, 13), ((0, 0), (3, 5), (7, 2), (4, 4)), strict=True))
+    stencils = []
+    for number, (row, col) in where.items():
         primitive = motions[number].primitive
         place = np.array([col, row]) * setup.step + judge._halo - (odd - 1) // 2
         poses = primitive.poses(setup.interval) + [*(place * setup.spacing), 0]
         nodes = nodes_at(poses, primitive.radii(setup.interval), window)
-        nodes = nodes // odd * count + nodes % odd
-        hazard = np.asarray(predictor.network.at(channels, nodes))[:, 0, :3]
-        expected = 1 / (1 + np.exp(-np.logaddexp.reduce(hazard.astype(float), axis=0)))
+        stencils.append(nodes // odd * count + nodes % odd)
+    hazard = np.asarray(predictor.network.at(channels, np.concatenate(stencils)))[:, 0, :3].astype(float)
+    parts = np.split(hazard, np.cumsum([len(nodes) for nodes in stencils])[:-1])
+    for (number, (row, col)), part in zip(where.items(), parts, strict=True):
+        expected = 1 / (1 + np.exp(-np.logaddexp.reduce(part, axis=0)))
         largest, _ = judge._kept[tile]
         assert largest[number, row, col] == pytest.approx(expected.max(), abs=2e-5)
         if in_the_way[number, row, col] == 0:
