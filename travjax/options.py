@@ -18,7 +18,7 @@ from travjax.terrain.styles import STYLES
 if TYPE_CHECKING:  # these take seconds to import
     from travjax.estimators.preset import Preset
     from travjax.runs.run import Run
-    from travjax.site.ground import SiteGround
+    from travjax.site import ground
 
 
 class Commands(Protocol):
@@ -263,7 +263,7 @@ def reading(arguments: argparse.Namespace) -> DemOptions:
     )
 
 
-def site(arguments: argparse.Namespace) -> "SiteGround":
+def site(arguments: argparse.Namespace) -> "ground.SiteGround":
     """Opens the elevation map of a whole site."""
     from travjax.site.ground import SiteGround
 
