@@ -276,6 +276,13 @@ def site(arguments: argparse.Namespace) -> "ground.SiteGround":
     )
 
 
+def require_left_out(arguments: argparse.Namespace, name: str, here: bool, where: str) -> None:
+    """Raises InputError if an option is given where it has no effect; where: in words, as in "with --estimator"."""
+    given = getattr(arguments, name)
+    none = given is None or given is False
+    require(none or not here, f"--{name.replace('_', '-')}", str(given), f"left out {where}")
+
+
 def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:
     """Returns the windows of elevation maps, or synthetic maps if no file is given; prints a description of them."""
     unused = ("style", "count", "seed", "world") if arguments.dem else DEM_OPTIONS

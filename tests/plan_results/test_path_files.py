@@ -56,7 +56,7 @@ def driven(ground: ArrayGround, motions: Sequence[str] | None = None, interval: 
         endpoint(name, one, planner.costs, "rowcol")
         for name, one in zip(("start", "via 1", "goal"), rowcol, strict=True)
     ]
-    return Plan(path, tuple(legs), 12.5, tuple(points), "", {}), planner
+    return Plan(path, tuple(legs), 12.5, tuple(points), "", 0), planner
 
 
 def rows_of(file: Path) -> list[dict[str, str]]:

@@ -7,7 +7,7 @@ import pytest
 
 from tests.planning.sites import NODES, SPACING, parted, plane, walled
 from travjax.config import InputError
-from travjax.planning.action_space import ActionSpacePlanner, Search, State
+from travjax.planning.action_space import ActionSpacePlanner, State, TrajectorySearch
 from travjax.planning.no_path import NoPathError
 from travjax.planning.path import PosedLeg, drive
 from travjax.planning.planner import Planner
@@ -97,9 +97,9 @@ def test_point_turns_sweep_over_no_obstacle():
     ground = plane()
     ground[35, 29] = 0.5  # ahead and to the left, where a corner of the robot would sweep over it
     at = np.array([4.0, 4.0, math.radians(-5)])
-    turn, _ = Search(planner(plane()), at, at)._turns(at)
+    turn, _ = TrajectorySearch(planner(plane()), at, at)._turns(at)
     np.testing.assert_allclose(np.degrees(turn), [5, 50, 95, 140, -175, -130, -85, -40], atol=1e-6)
-    turn, _ = Search(planner(ground), at, at)._turns(at)
+    turn, _ = TrajectorySearch(planner(ground), at, at)._turns(at)
     np.testing.assert_allclose(np.degrees(turn), [5, np.inf, np.inf, np.inf, np.inf, np.inf, -85, -40], atol=1e-6)
 
 

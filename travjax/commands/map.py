@@ -3,7 +3,6 @@
 import argparse
 
 from travjax import options
-from travjax.config import require
 from travjax.files import user_path
 from travjax.rasters.formats import OTHERS
 from travjax.signals import going_on
@@ -40,10 +39,8 @@ def run(arguments: argparse.Namespace) -> None:
     from travjax.site.mapping import save_map, say_notes, setup_of
 
     passes = arguments.robot, arguments.headings, arguments.stride
-    if arguments.method == "geometric":
-        for name in ("grid_map", "scheduler"):
-            given = getattr(arguments, name)
-            require(given is None, f"--{name.replace('_', '-')}", str(given), "left out with --method geometric")
+    for name in ("grid_map", "scheduler"):
+        options.require_left_out(arguments, name, arguments.method == "geometric", "with --method geometric")
     if arguments.spacing is not None or not arguments.allow_coarse:  # refuses what is wrong before the site is read
         setup_of(*passes, 0.0625 if arguments.spacing is None else arguments.spacing, arguments.contact)
     site = options.site(arguments)

@@ -146,12 +146,12 @@ def _require_together(arguments: argparse.Namespace) -> None:
 
     require(bool(arguments.start or arguments.to_go), "--from", None, "given, unless --to-go is")
     for name in ("via", "ros_path"):
-        _require_left_out(arguments, name, arguments.start is None, "where --from is")
+        options.require_left_out(arguments, name, arguments.start is None, "where --from is")
     for name in ("via", "to_go", "estimator", "unknown_cost", "primitives"):
         by_trajectories = arguments.planner == ACTION_SPACE
-        _require_left_out(arguments, name, by_trajectories, f"with --planner {ACTION_SPACE}")
-    _require_left_out(arguments, "unknown_cost", arguments.estimator is not None, "with --estimator")
-    _require_left_out(arguments, "threshold", arguments.estimator is None, "without --estimator")
+        options.require_left_out(arguments, name, by_trajectories, f"with --planner {ACTION_SPACE}")
+    options.require_left_out(arguments, "unknown_cost", arguments.estimator is not None, "with --estimator")
+    options.require_left_out(arguments, "threshold", arguments.estimator is None, "without --estimator")
     out, graph = arguments.out, arguments.route_graph
     require(out.is_dir() or not out.exists(), "--out", str(out), "a folder")
     if graph:
@@ -160,13 +160,6 @@ def _require_together(arguments: argparse.Namespace) -> None:
         )
     if arguments.ros_path:
         require_recording("--ros-path", arguments.ros_path)
-
-
-def _require_left_out(arguments: argparse.Namespace, name: str, here: bool, where: str) -> None:
-    """Raises InputError if an option is given where it has no effect; where: in words, as in "with --estimator"."""
-    given = getattr(arguments, name)
-    none = given is None or given is False
-    require(none or not here, f"--{name.replace('_', '-')}", str(given), f"left out {where}")
 
 
 def _planner(arguments: argparse.Namespace, site: "SiteGround") -> "Planner":

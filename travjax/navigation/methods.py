@@ -14,9 +14,9 @@ from travjax.planning.judges import Judged
 from travjax.planning.motions import MotionLattice
 from travjax.planning.planner import Planner
 from travjax.runs.predictor import Predictor
-from travjax.site.geometric import FORBIDDEN, geometric_tile
+from travjax.site.geometric import FORBIDDEN, geometric_bands
 from travjax.site.ground import ArrayGround, Site
-from travjax.site.kernel import SiteSetup, Tile, tiles_of
+from travjax.site.kernel import SiteSetup, Tile
 
 GEOMETRIC, SIMULATOR, FILTERED = "geometric cost map", "simulator", "simulator, best filter"
 CAUTIOUS, THRESHOLD, RISK = "simulator, best filter, lower limits", "hazard field", "hazard field as risk"
@@ -35,11 +35,7 @@ class GeometricJudge:
     final = False
 
     def __init__(self, ground: Site, setup: SiteSetup, lattice: MotionLattice):
-        self._lattice, shape = lattice, setup.lattice(ground.shape)
-        cost = np.full(shape, np.nan, np.float32)
-        for tile in tiles_of(shape, setup):
-            found = np.asarray(geometric_tile(ground.part(*tile.ground(setup)), setup))[-1]
-            cost[tile.within(shape)] = tile.cropped(found, shape)
+        self._lattice, cost = lattice, geometric_bands(ground, setup)[-1]
         impossible = np.isnan(cost) | (cost >= FORBIDDEN)
         self._factor = np.where(impossible, np.inf, 1 + lattice.motions.risk * (cost / FORBIDDEN) ** 2)
         self._offsets = [self._under(number, setup) for number in range(len(lattice.all))]

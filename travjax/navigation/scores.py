@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from itertools import cycle
 from statistics import NormalDist
 
 import numpy as np
@@ -30,12 +29,17 @@ def interval(count: int, total: int) -> tuple[float, float]:
     return max(0.0, (centre - half) / (1 + z**2 / total)), min(1.0, (centre + half) / (1 + z**2 / total))
 
 
+def _alike(trials: Sequence[Trial], kind: str, corruption: str, method: str) -> list[Trial]:
+    """Returns the trials of one method on one kind of ground, seen with one corruption."""
+    return [one for one in trials if (one.kind, one.corruption, one.method) == (kind, corruption, method)]
+
+
 def table(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str:
     """Returns a table of one kind of ground: a row for each corruption and method."""
     rows = []
     for corruption in corruptions:
         for method in METHODS:
-            mine = [one for one in trials if (one.kind, one.corruption, one.method) == (kind, corruption, method)]
+            mine = _alike(trials, kind, corruption, method)
             if not mine:
                 continue
             counts = {end: sum(one.ended == end for one in mine) for end in (ARRIVED, FAILED, REFUSED)}
@@ -62,7 +66,7 @@ def winners(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> s
     for corruption in corruptions:
         shares = {}
         for method in METHODS:
-            mine = [one for one in trials if (one.kind, one.corruption, one.method) == (kind, corruption, method)]
+            mine = _alike(trials, kind, corruption, method)
             if mine:
                 shares[method] = (sum(one.ended == ARRIVED for one in mine), len(mine))
         best = max(shares, key=lambda method: shares[method][0] / shares[method][1])
@@ -81,7 +85,7 @@ def figure(trials: Sequence[Trial], corruptions: Sequence[str]) -> Figure:
     for column, kind in enumerate(kinds):
         for row, (end, title) in enumerate(((ARRIVED, "arrived"), (FAILED, "failed on the way"))):
             ax = axes[row, column]
-            _draw(ax, [one for one in trials if one.kind == kind], corruptions, end)
+            _draw(ax, trials, kind, corruptions, end)
             tasks = len({(one.ground, one.task) for one in trials if one.kind == kind})
             ax.set_title(f"{kind}, {tasks} tasks" if row == 0 else "")
             ax.set_ylabel(f"share that {title}" if column == 0 else "")
@@ -93,12 +97,12 @@ def figure(trials: Sequence[Trial], corruptions: Sequence[str]) -> Figure:
     return drawn
 
 
-def _draw(ax, trials: Sequence[Trial], corruptions: Sequence[str], end: str) -> None:
-    """Draws the shares of one end of a task, a little apart from each other."""
-    for number, (method, colour, marker) in enumerate(zip(METHODS, cycle(COLOURS), cycle(MARKERS), strict=False)):
+def _draw(ax, trials: Sequence[Trial], kind: str, corruptions: Sequence[str], end: str) -> None:
+    """Draws the shares of one end of a task on one kind of ground, a little apart from each other."""
+    for number, (method, colour, marker) in enumerate(zip(METHODS, COLOURS, MARKERS, strict=True)):
         x, y, low, high = [], [], [], []
         for place, corruption in enumerate(corruptions):
-            mine = [one.ended == end for one in trials if (one.corruption, one.method) == (corruption, method)]
+            mine = [one.ended == end for one in _alike(trials, kind, corruption, method)]
             if mine:
                 share, (least, most) = np.mean(mine), interval(sum(mine), len(mine))
                 x.append(place + 0.1 * (number - len(METHODS) / 2))

@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from travjax.config import InputError, require, require_number
 from travjax.data.sensor_noise import CORRUPTIONS
@@ -72,7 +71,5 @@ def _trial(planner: Planner, ground: Ground, task: Task, config: NavigationConfi
     except (NoPathError, InputError):
         return REFUSED, 0.0
     setup = replace(planner.setup, robot=config.true_robot)
-    heading = planner.lattice.angles[first % planner.lattice.headings]
-    start: Float[np.ndarray, " 3"] = np.array([points[0].x, points[0].y, heading])
-    path, _ = drive(legs, start, ground.site, setup)
+    path, _ = drive(legs, planner.pose_of(first), ground.site, setup)
     return (FAILED if path.exceeds.any() else ARRIVED), path.length / task.length

@@ -28,10 +28,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from travjax.config import InputError, require, require_number, shown
-from travjax.planning.endpoints import Endpoint, endpoint, on_site, place_text, standing, why_not_standing
+from travjax.planning.endpoints import Endpoint, endpoint, on_site, place_text, standing
 from travjax.planning.judges import UNKNOWN_NAME
 from travjax.planning.motions import TURN_PART
-from travjax.planning.no_path import NoPathError, Reached, no_path, reached_places, standing_beside
+from travjax.planning.no_path import NoPathError, Reached, cannot_stand, reached_places, standing_beside
 from travjax.planning.path import Path, PosedLeg, drive
 from travjax.planning.planner import Plan, Planner
 from travjax.progress import bar
@@ -125,25 +125,18 @@ class ActionSpacePlanner:
         off the site and where the robot cannot stand at the start.
         """
         points = self._point("start", start, coordinates), self._point("goal", goal, coordinates)
-        search = Search(self, *(self._pose(point) for point in points))
+        search = TrajectorySearch(self, *(self._pose(point) for point in points))
         if not search.can_stand():
             self.planner.require_standing(points[0])
             raise InputError(f"start = {shown(points[0].given)}: the robot cannot stand exactly there")
         if not standing(points[1], self.costs):
-            why = f"goal = {shown(points[1].given)}: {why_not_standing(points[1], self.costs)}"
-            raise NoPathError(why, no_path(*points, self.costs).reached, *points)
+            raise cannot_stand(*points, self.costs)
         found = search.run()
         if found is None:
             raise self._no_path(*points, search)
         path, state = found
-        checks = {
-            "poses simulated": len(path.z),
-            "poses that exceed a limit": int(path.exceeds.sum()),
-            "poses on unknown ground": int((~path.known).sum()),
-            "motions refused before": search.refused,
-        }
         method = f"{len(self.actions)} trajectories from each state"
-        return Plan(path, tuple(state.path()), state.cost, points, method, checks)
+        return Plan(path, tuple(state.path()), state.cost, points, method, search.refused)
 
     def _point(self, name: str, given: Any, coordinates: str) -> Endpoint:
         """Returns a point, exactly where it was given."""
@@ -155,12 +148,9 @@ class ActionSpacePlanner:
         origin, heading = self.costs.ground.origin, point.given[2] if len(point.given) == 3 else math.nan
         return np.array([point.x - origin[0], point.y - origin[1], heading])
 
-    def _no_path(self, start: Endpoint, goal: Endpoint, search: "Search") -> NoPathError:
+    def _no_path(self, start: Endpoint, goal: Endpoint, search: "TrajectorySearch") -> NoPathError:
         reached = search.reached(goal)
-        row, col = reached.nearest
-        x, y = (
-            value + place * self.site.stride for value, place in zip(self.costs.ground.origin, (col, row), strict=True)
-        )
+        x, y = self.costs.at(*reached.nearest)
         ended = "nothing is left to go on from"
         if search.tried >= self.most:
             ended = f"gave up after {search.tried} trajectories"
@@ -175,7 +165,7 @@ class ActionSpacePlanner:
         return NoPathError(text, reached, start, goal)
 
 
-class Search:
+class TrajectorySearch:
     """The search for one path, from pose to pose, x and y counted from the site's south-west node.
 
     tried, refused: trajectories that the sequential simulators tried, and refused

@@ -50,10 +50,15 @@ class MotionCosts:
         """The factor of cost of the robot standing at every place in every heading, and what is in its way there."""
         return self.judge.standing()
 
-    @property
+    @cached_property
     def easiest(self) -> Float32[np.ndarray, "rows cols"]:
         """The smallest factor of cost at every place, in its best heading."""
         return self.standing[0].min(axis=0)
+
+    def at(self, row: int, col: int) -> tuple[float, float]:
+        """Returns x and y of a place, in coordinates of the site."""
+        x, y = self.ground.origin
+        return x + col * self.lattice.stride, y + row * self.lattice.stride
 
     def evaluate(self, places: Iterable[int]) -> None:
         """Judges the motions in the tiles of the first places where they are missing, as many as there are cores."""

@@ -56,16 +56,14 @@ def endpoint(name: str, given: Any, costs: MotionCosts, coordinates: str = "site
         math.floor((value - start) / stride + 0.5) for value, start in ((y, ground.origin[1]), (x, ground.origin[0]))
     )
     rows, cols = costs.shape
-    east, north = (start + (count - 1) * stride for start, count in zip(ground.origin, (cols, rows), strict=True))
-    south, west = ground.origin[1], ground.origin[0]
-    allowed = f"on the site, from {place_text(west, south)} to {place_text(east, north)}; it is at {place_text(x, y)}"
+    ends = place_text(*costs.at(0, 0)), place_text(*costs.at(rows - 1, cols - 1))
+    allowed = f"on the site, from {ends[0]} to {ends[1]}; it is at {place_text(x, y)}"
     require(0 <= row < rows and 0 <= col < cols, name, point, allowed)
     heading = None
     if len(point) == 3:
         headings = costs.lattice.headings
         heading = round(point[2] / (2 * math.pi) * headings) % headings
-    at = ground.origin[0] + col * stride, ground.origin[1] + row * stride
-    return Endpoint(name, point, row, col, *at, heading)
+    return Endpoint(name, point, row, col, *costs.at(row, col), heading)
 
 
 def on_site(name: str, point: tuple[float, ...], ground: Site, coordinates: str) -> tuple[float, float]:
@@ -99,14 +97,15 @@ def standing(point: Endpoint, costs: MotionCosts) -> list[int]:
 
 
 def why_not_standing(point: Endpoint, costs: MotionCosts) -> str:
-    """Says why the robot cannot stand at a point, and the nearest place where it can."""
+    """Says which point it is, why the robot cannot stand there, and the nearest place where it can."""
     headings = slice(None) if point.heading is None else slice(point.heading, point.heading + 1)
     codes, counts = np.unique(costs.standing[1][headings, point.row, point.col], return_counts=True)
     reason = in_the_way_named(int(codes[counts.argmax()]), costs)
     where = (
         "in any heading" if point.heading is None else f"in heading {360 * point.heading / costs.lattice.headings:g}"
     )
-    return f"the robot cannot stand there {where} ({reason}); {_nearest(point, costs, headings)}"
+    given = f"{point.name} = {shown(point.given)}"
+    return f"{given}: the robot cannot stand there {where} ({reason}); {_nearest(point, costs, headings)}"
 
 
 def _nearest(point: Endpoint, costs: MotionCosts, headings: slice) -> str:
@@ -114,9 +113,7 @@ def _nearest(point: Endpoint, costs: MotionCosts, headings: slice) -> str:
     if not len(rows):
         return "it can stand nowhere on the site"
     best = np.hypot(rows - point.row, cols - point.col).argmin()
-    stride, origin = costs.lattice.stride, costs.ground.origin
-    x, y = origin[0] + cols[best] * stride, origin[1] + rows[best] * stride
-    return f"the nearest place where it can is {place_text(x, y)}"
+    return f"the nearest place where it can is {place_text(*costs.at(rows[best], cols[best]))}"
 
 
 def place_text(x: float, y: float) -> str:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int, UInt8
 from scipy.ndimage import binary_dilation
 
 from travjax.planning.costs import MotionCosts
-from travjax.planning.endpoints import Endpoint, in_the_way_named, place_text
+from travjax.planning.endpoints import Endpoint, in_the_way_named, place_text, why_not_standing
 from travjax.planning.judges import UNKNOWN
 from travjax.planning.search import Search, bounds
 
@@ -36,6 +36,11 @@ class NoPathError(Exception):
         self.reached, self.start, self.goal = reached, start, goal
 
 
+def cannot_stand(start: Endpoint, goal: Endpoint, costs: MotionCosts) -> NoPathError:
+    """Returns the error for a goal at which the robot cannot stand."""
+    return NoPathError(why_not_standing(goal, costs), no_path(start, goal, costs).reached, start, goal)
+
+
 def no_path(start: Endpoint, goal: Endpoint, costs: MotionCosts, search: Search | None = None) -> NoPathError:
     """Returns the error that says why there is no path.
 
@@ -55,25 +60,22 @@ def reached_places(
     costs: MotionCosts,
 ) -> Reached:
     """Returns what is reached, from the places and how often each event is in the way next to them, unknown last."""
-    codes = [0, *range(1, 1 + len(costs.robot.events)), UNKNOWN]
-    frontier = np.array(codes, np.uint8)[np.where(counts.any(axis=0), 1 + counts.argmax(axis=0), 0)]
+    frontier = np.array([0, *_codes(costs)], np.uint8)[np.where(counts.any(axis=0), 1 + counts.argmax(axis=0), 0)]
     rows, cols = np.nonzero(places)
     best = int(np.hypot(rows - goal.row, cols - goal.col).argmin())
     return Reached(places, frontier, (int(rows[best]), int(cols[best])))
 
 
 def _message(start: Endpoint, goal: Endpoint, reached: Reached, by_state: bool, costs: MotionCosts) -> str:
-    stride, (x, y) = costs.lattice.stride, costs.ground.origin
     row, col = reached.nearest
-    away = math.hypot(row - goal.row, col - goal.col) * stride
+    away = math.hypot(row - goal.row, col - goal.col) * costs.lattice.stride
     whatever = "" if by_state else ", even if headings did not matter"
     text = (
         f"no path from {start.name} {place_text(start.x, start.y)} to {goal.name} {place_text(goal.x, goal.y)}: "
         f"{reached.places.sum()} of {reached.places.size} places can be reached{whatever}; "
     )
     if away > 0:
-        nearest = place_text(x + col * stride, y + row * stride)
-        text += f"the nearest to {goal.name} is {nearest}, {away:.2f} m from it"
+        text += f"the nearest to {goal.name} is {place_text(*costs.at(row, col))}, {away:.2f} m from it"
     else:
         text += f"{goal.name} is one of them, but not in the heading that is wanted"
     codes, counts = np.unique(reached.frontier[reached.frontier > 0], return_counts=True)
@@ -95,8 +97,12 @@ def _by_places(start: Endpoint, costs: MotionCosts) -> tuple[np.ndarray, np.ndar
 def standing_beside(places: Bool[np.ndarray, "rows cols"], costs: MotionCosts) -> Int[np.ndarray, "codes rows cols"]:
     """Returns how often, over the headings, each event keeps the robot from standing next to places, unknown last."""
     beside = binary_dilation(places, np.ones((3, 3))) & ~np.isfinite(costs.easiest)
-    codes = (*range(1, 1 + len(costs.robot.events)), UNKNOWN)
-    return np.stack([(costs.standing[1] == code).sum(axis=0) for code in codes]) * beside
+    return np.stack([(costs.standing[1] == code).sum(axis=0) for code in _codes(costs)]) * beside
+
+
+def _codes(costs: MotionCosts) -> tuple[int, ...]:
+    """Returns what may stand in the way: the numbers of the robot's events, unknown ground last."""
+    return (*range(1, 1 + len(costs.robot.events)), UNKNOWN)
 
 
 def _by_states(search: Search, costs: MotionCosts) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +110,7 @@ def _by_states(search: Search, costs: MotionCosts) -> tuple[np.ndarray, np.ndarr
     rows, cols = costs.shape
     closed, moves = search.closed.reshape(rows, cols, -1), search.moves
     places = np.asarray(closed.any(axis=-1))
-    codes = (*range(1, 1 + len(costs.robot.events)), UNKNOWN)
+    codes = _codes(costs)
     counts = np.zeros((len(codes), rows, cols), np.int32)
     for heading, step in zip(*np.nonzero(moves.motion >= 0), strict=True):
         row, col = np.nonzero(closed[..., heading])

@@ -1,6 +1,6 @@
 """The planner: from here to there on a site, or what stands in the way (SPEC section 14)."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path as FilePath
@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from travjax.config import InputError, require_number, shown
+from travjax.config import InputError, require_number
 from travjax.jax_flags import usual_flags
 from travjax.planning.costs import MotionCosts
 from travjax.planning.endpoints import Endpoint, endpoint, standing, why_not_standing
 from travjax.planning.judges import Judge, MarginJudge
 from travjax.planning.motions import MotionLattice, Motions
-from travjax.planning.no_path import NoPathError, no_path
+from travjax.planning.no_path import cannot_stand, no_path
 from travjax.planning.path import Leg, Path, Stretch, drive
 from travjax.planning.search import Search, bounds
 from travjax.simulation.robot import Robot
@@ -37,8 +37,7 @@ class Plan:
     cost:   as of Motions, the least that these motions allow
     points: where it begins, passes and ends, on the lattice
     found_by: what was searched, and what judged it
-    checks: what the sequential simulators said: poses simulated, poses that exceed a limit, poses on unknown ground,
-            and motions that were refused before
+    refused: motions that the sequential simulators refused before
     """
 
     path: Path
@@ -46,7 +45,17 @@ class Plan:
     cost: float
     points: tuple[Endpoint, ...]
     found_by: str
-    checks: Mapping[str, int]
+    refused: int
+
+    @property
+    def checks(self) -> dict[str, int]:
+        """What the sequential simulators said, in words."""
+        return {
+            "poses simulated": len(self.path.z),
+            "poses that exceed a limit": int(self.path.exceeds.sum()),
+            "poses on unknown ground": int((~self.path.known).sum()),
+            "motions refused before": self.refused,
+        }
 
 
 class Planner:
@@ -106,28 +115,21 @@ class Planner:
     def require_standing(self, start: Endpoint) -> None:
         """Raises InputError that says why the robot cannot stand at the start of a path, and where it could."""
         if not standing(start, self.costs):
-            raise InputError(f"{start.name} = {shown(start.given)}: {why_not_standing(start, self.costs)}")
+            raise InputError(why_not_standing(start, self.costs))
 
     def checked(self, points: Sequence[Endpoint], find: Callable[[], Found]) -> Plan:
         """Finds motions, simulates their poses once more, and goes on without those that the simulators refuse."""
-        before, start, stride = self.costs.refused, points[0], self.setup.stride
+        before = self.costs.refused
         while True:
             legs, cost, first = find()
-            at = np.array([start.col * stride, start.row * stride, self.lattice.angles[first % self.lattice.headings]])
-            path, owner = drive(legs, at, self.costs.ground, self.setup)
+            path, owner = drive(legs, self.pose_of(first), self.costs.ground, self.setup)
             judge = self.costs.judge
             bad = path.exceeds if judge.unknown_allowed else path.exceeds | ~path.known
             if not (judge.final and legs and bad.any()):
                 break
             for number in {owner[row] for row in np.flatnonzero(bad)}:
                 self.costs.block(legs[number])
-        checks = {
-            "poses simulated": len(path.z),
-            "poses that exceed a limit": int(path.exceeds.sum()),
-            "poses on unknown ground": int((~path.known).sum()),
-            "motions refused before": self.costs.refused - before,
-        }
-        return Plan(path, tuple(legs), cost, tuple(points), self.method, checks)
+        return Plan(path, tuple(legs), cost, tuple(points), self.method, self.costs.refused - before)
 
     def cheapest(self, points: Sequence[Endpoint]) -> Found:
         """Returns the motions of the cheapest path, its cost, and the state where it begins."""
@@ -136,9 +138,7 @@ class Planner:
         for here, there in zip(points, points[1:], strict=False):
             goals = standing(there, self.costs)
             if not goals:
-                error = no_path(here, there, self.costs)
-                why = f"{there.name} = {shown(there.given)}: {why_not_standing(there, self.costs)}"
-                raise NoPathError(why, error.reached, here, there)
+                raise cannot_stand(here, there, self.costs)
             bound = bounds(self.lattice, self.costs.easiest, [there.row * self.costs.shape[1] + there.col])
             search = Search(self.lattice.moves, self.lattice.headings, bound)
             for state, cost in starts.items():
@@ -154,6 +154,12 @@ class Planner:
             legs[:0] = [self.leg(search, *step) for step in steps]
             state = steps[0][0] if steps else state
         return legs, cost, state
+
+    def pose_of(self, state: int) -> Float[np.ndarray, " 3"]:
+        """Returns x and y of a state in metres from the site's south-west node, and its heading in radians."""
+        place, heading = divmod(state, self.lattice.headings)
+        row, col = divmod(place, self.costs.shape[1])
+        return np.array([col * self.setup.stride, row * self.setup.stride, self.lattice.angles[heading]])
 
     def leg(self, search: Search, state: int, heading: int, step: int) -> Leg:
         """Returns the motion of a step of a search from a state."""

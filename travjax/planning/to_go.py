@@ -5,10 +5,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from travjax.config import shown
 from travjax.jax_flags import usual_flags
-from travjax.planning.endpoints import endpoint, standing, why_not_standing
-from travjax.planning.no_path import NoPathError, no_path
+from travjax.planning.endpoints import endpoint, standing
+from travjax.planning.no_path import cannot_stand
 from travjax.planning.planner import Found, Plan, Planner
 from travjax.planning.search import NOWHERE, Search
 
@@ -24,8 +23,7 @@ class CostToGo:
         """See `travjax.plan` for the arguments."""
         self.planner, self.goal = planner, endpoint("goal", goal, planner.costs, coordinates)
         if not standing(self.goal, planner.costs):
-            why = f"goal = {shown(self.goal.given)}: {why_not_standing(self.goal, planner.costs)}"
-            raise NoPathError(why, no_path(self.goal, self.goal, planner.costs).reached, self.goal, self.goal)
+            raise cannot_stand(self.goal, self.goal, planner.costs)
         self._search, self._refused = self._searched(), planner.costs.refused
 
     @usual_flags()

@@ -7,6 +7,7 @@ Source: github.com/picchius94/unstruct_navigation, class Traversability_Map.
 """
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from travjax.jax_flags import usual_flags
 from travjax.simulation.robot import Robot
 from travjax.site.costs import KINDS, UNKNOWN_COST, band_names, kinds_of
 from travjax.site.geotiff import Frame, rasterio, save_geotiff
-from travjax.site.ground import SiteGround
+from travjax.site.ground import Ground, SiteGround
 from travjax.site.kernel import SiteSetup, by_place, lanes_of, tiles_of
 from travjax.site.mapping import require_not_written
 from travjax.site.nav2 import save_nav2
@@ -84,6 +85,19 @@ def _costs(ground: jax.Array, nodes: jax.Array, offsets: jax.Array, setup: SiteS
     return by_place(jnp.concatenate([tests, cost[None]]), around, around - 2 * setup.halo)
 
 
+def geometric_bands(
+    ground: Ground, setup: SiteSetup, on_progress: Callable[[], object] = lambda: None
+) -> Float[np.ndarray, "4 rows cols"]:
+    """Computes BANDS of all places of a site, NaN where unknown; on_progress: is called after each tile."""
+    lattice = setup.lattice(ground.shape)
+    bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
+    for tile in tiles_of(lattice, setup):
+        found = geometric_tile(ground.part(*tile.ground(setup)), setup)
+        bands[(..., *tile.within(lattice))] = tile.cropped(found, lattice)
+        on_progress()
+    return bands
+
+
 def save_geometric(site: SiteGround, setup: SiteSetup, out: str | Path) -> Path:
     """Writes the geometric cost map of a site, geometric.tif and one for Nav2; returns the folder.
 
@@ -93,14 +107,9 @@ def save_geometric(site: SiteGround, setup: SiteSetup, out: str | Path) -> Path:
     rasterio()
     require_not_written(site, [Path(out) / "geometric.tif"])
     lattice = setup.lattice(site.shape)
-    tiles = tiles_of(lattice, setup)
     with held(folder := output_folder(out)):
-        bands = np.full((len(BANDS), *lattice), np.nan, np.float32)
-        with progress.bar("mapping", len(tiles), "tile") as bar:
-            for tile in tiles:
-                found = geometric_tile(site.part(*tile.ground(setup)), setup)
-                bands[(..., *tile.within(lattice))] = tile.cropped(found, lattice)
-                bar.update()
+        with progress.bar("mapping", len(tiles_of(lattice, setup)), "tile") as bar:
+            bands = geometric_bands(site, setup, bar.update)
         bands, frame = bands[:, ::-1], Frame(site.origin, setup.stride, site.crs)
         cost = bands[-1]
         percent = np.where(np.isnan(cost), UNKNOWN_COST, np.floor(np.nan_to_num(cost) * (100 / FORBIDDEN)))
