@@ -5,14 +5,14 @@ import math
 import pytest
 
 from travjax.config import InputError
-from travjax.rasters.recordings import header, pose, require_recording, typestore, write_message
+from travjax.rasters.recordings import header, kind_of, pose, require_recording, typestore, write_message
 
 pytest.importorskip("rosbags", reason="the extra ros is not installed")
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, -2.0, math.pi, 6.0])
 def test_the_yaw_of_a_pose_counts_from_x(yaw):
-    made = pose(typestore({}), 1.0, 2.0, 3.0, yaw)
+    made = pose(kind_of(typestore({})), 1.0, 2.0, 3.0, yaw)
     z, w = made.orientation.z, made.orientation.w
     assert (made.position.x, made.position.y, made.position.z) == (1, 2, 3)
     assert made.orientation.x == made.orientation.y == 0
@@ -29,7 +29,7 @@ def test_a_message_is_read_back(tmp_path, name):
     with AnyReader([tmp_path / name], default_typestore=store) as reader:
         ((connection, time, raw),) = reader.messages()
         assert (connection.topic, time, reader.deserialize(raw, connection.msgtype).data) == ("/number", 0, 2.5)
-    assert "mine_msgs/msg/Numbers" in store.types and header(store, "odom").frame_id == "odom"
+    assert "mine_msgs/msg/Numbers" in store.types and header(kind_of(store), "odom").frame_id == "odom"
 
 
 @pytest.mark.parametrize("name", ["out.bag", "none/out.mcap", "folder.mcap"])

@@ -19,7 +19,7 @@ from travjax.planning.endpoints import from_earth
 from travjax.planning.path import Path
 from travjax.planning.planner import Plan, Planner
 from travjax.rasters.coordinates import why_not_on_earth
-from travjax.rasters.recordings import header, pose, require_recording, typestore, write_message
+from travjax.rasters.recordings import Kind, header, kind_of, pose, require_recording, typestore, write_message
 from travjax.site.ground import Site
 
 COLUMNS = ("x", "y", "z", "heading_deg", "distance", "primitive", "step", "obstacle", "tilt")
@@ -123,26 +123,34 @@ def save_ros_path(file: FilePath, plan: Plan, planner: Planner) -> FilePath:
     """Writes a path as one message nav_msgs/Path on the topic /plan, in the frame of the site or "map"; returns the
     file.
 
-    file: .mcap or .db3. Yaw counts from +x, as everywhere in ROS. On unknown ground the height is that between the
-    nearest poses on known ground.
+    file: .mcap or .db3
     Raises InputError when rosbags is missing, and when the file cannot be written.
     """
     require_recording("path", file)
-    path, frame = plan.path, planner.costs.ground.frame or "map"
+    store = typestore({})
+    kind = kind_of(store)
+    message = path_message(kind, header(kind, planner.costs.ground.frame or "map"), plan.path)
+    with atomic_write(file) as temporary:
+        write_message(temporary, TOPIC, KIND, message, store)
+    return file
+
+
+def path_message(kind: Kind, header: Any, path: Path) -> Any:
+    """Returns a path as a message nav_msgs/Path, of which each pose has the same header.
+
+    Yaw counts from +x, as everywhere in ROS. On unknown ground the height is that between the nearest poses on known
+    ground.
+    """
     z = np.where(path.known, path.z, 0)
     if path.known.any():
         between = np.interp(path.distance, path.distance[path.known], path.z[path.known])
         z = np.where(path.known, path.z, between)
-    store = typestore({})
-    stamped = store.types["geometry_msgs/msg/PoseStamped"]
+    stamped = kind("geometry_msgs/msg/PoseStamped")
     poses = [
-        stamped(header(store, frame), pose(store, x, y, height, heading + math.pi / 2))
+        stamped(header=header, pose=pose(kind, x, y, height, heading + math.pi / 2))
         for (x, y, heading), height in zip(path.pose.tolist(), z.tolist(), strict=True)
     ]
-    message = store.types[KIND](header(store, frame), poses)
-    with atomic_write(file) as temporary:
-        write_message(temporary, TOPIC, KIND, message, store)
-    return file
+    return kind(KIND)(header=header, poses=poses)
 
 
 def feature(kind: str, coordinates: list, properties: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 from travjax.config import InputError, require
 from travjax.rasters.raster import InMetres, Raster, agreed_cell_size
 from travjax.rasters.reading_options import DemOptions
-from travjax.rasters.recordings import header, pose, rosbags, typestore, write_message
+from travjax.rasters.recordings import Kind, header, kind_of, pose, rosbags, typestore, write_message
 
 TYPE = "grid_map_msgs/msg/GridMap"
 
@@ -57,7 +57,7 @@ def read_grid_map(path: Path, options: DemOptions) -> Raster:
     try:
         with engine.highlevel.AnyReader([path], default_typestore=grid_map_types()) as reader:
             message = _message(reader, options)
-            return _raster(message, options)
+            return raster_of(message, options)
     except InputError:
         raise
     except Exception as error:  # rosbags raises whatever its parsers do
@@ -82,7 +82,11 @@ def _message(reader: Any, options: DemOptions) -> Any:
     return reader.deserialize(latest[1], latest[0].msgtype)
 
 
-def _raster(message: Any, options: DemOptions) -> Raster:
+def raster_of(message: Any, options: DemOptions) -> Raster:
+    """Returns a layer of a GridMap, a message of rosbags or of ROS.
+
+    Raises InputError when the layer has to be chosen, or is not there, and when the map is turned.
+    """
     layers = list(message.layers)
     require(len(layers) > 0, "layers", layers, "at least one")
     info, index = message.info, layers.index(_chosen("layer", options.layer, layers))
@@ -131,18 +135,36 @@ def write_grid_map(
     origin: x, y of the south-west cell's middle, metres
     """
     store = grid_map_types()
-    kinds = store.types
+    kind = kind_of(store)
+    message = grid_map_message(kind, header(kind, frame), layers, cell_size, origin)
+    write_message(path, "/grid_map", TYPE, message, store)
+
+
+def grid_map_message(
+    kind: Kind, header: Any, layers: Mapping[str, np.ndarray], cell_size: float, origin: tuple[float, float]
+) -> Any:
+    """Returns layers [rows, cols] as one message with a header.
+
+    origin: x, y of the south-west cell's middle, metres
+    """
     rows, cols = next(iter(layers.values())).shape
     x, y = origin[0] + (cols - 1) / 2 * cell_size, origin[1] + (rows - 1) / 2 * cell_size
-    info = kinds["grid_map_msgs/msg/GridMapInfo"](
-        resolution=cell_size, length_x=cols * cell_size, length_y=rows * cell_size, pose=pose(store, x, y)
+    info = kind("grid_map_msgs/msg/GridMapInfo")(
+        resolution=cell_size, length_x=cols * cell_size, length_y=rows * cell_size, pose=pose(kind, x, y)
     )
-    dimension = kinds["std_msgs/msg/MultiArrayDimension"]
-    dims = [dimension("column_index", rows, rows * cols), dimension("row_index", cols, cols)]
-    layout = kinds["std_msgs/msg/MultiArrayLayout"](dim=dims, data_offset=0)
-    data = [
-        kinds["std_msgs/msg/Float32MultiArray"](layout, np.ascontiguousarray(layer[::-1, ::-1], np.float32).ravel())
-        for layer in layers.values()
+    dimension = kind("std_msgs/msg/MultiArrayDimension")
+    dims = [
+        dimension(label="column_index", size=rows, stride=rows * cols),
+        dimension(label="row_index", size=cols, stride=cols),
     ]
-    message = kinds[TYPE](header(store, frame), info, list(layers), [], data, 0, 0)
-    write_message(path, "/grid_map", TYPE, message, store)
+    layout = kind("std_msgs/msg/MultiArrayLayout")(dim=dims, data_offset=0)
+    values = [np.ascontiguousarray(layer[::-1, ::-1], np.float32).ravel() for layer in layers.values()]
+    return kind(TYPE)(
+        header=header,
+        info=info,
+        layers=list(layers),
+        basic_layers=[],
+        data=[kind("std_msgs/msg/Float32MultiArray")(layout=layout, data=one) for one in values],
+        outer_start_index=0,
+        inner_start_index=0,
+    )

@@ -1,7 +1,7 @@
-"""Recordings of ROS by the package rosbags, without ROS: types of messages, and files of one message."""
+"""Messages of ROS, and recordings of them by the package rosbags, without ROS."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -10,6 +10,9 @@ from travjax.config import require, require_installed
 
 SUFFIXES = (".mcap", ".db3")
 """What the names of recordings that can be written end in."""
+
+Kind = Callable[[str], Any]
+"""Returns the class of messages by its name, such as nav_msgs/msg/Path: one of rosbags, or of ROS itself."""
 
 
 def rosbags() -> ModuleType:
@@ -31,6 +34,11 @@ def typestore(definitions: Mapping[str, str]) -> Any:
     return store
 
 
+def kind_of(store: Any) -> Kind:
+    """Returns what finds the classes of rosbags among the message types of `typestore`."""
+    return store.types.__getitem__
+
+
 def require_recording(field: str, path: Path) -> None:
     """Raises InputError, which begins with the field, unless a recording can be written there."""
     rosbags()
@@ -38,18 +46,17 @@ def require_recording(field: str, path: Path) -> None:
     require(fits, field, str(path), f"a file in a folder that exists, its name ending in {' or '.join(SUFFIXES)}")
 
 
-def header(store: Any, frame: str) -> Any:
+def header(kind: Kind, frame: str) -> Any:
     """Returns the header of a message in a frame, at time 0."""
-    kinds = store.types
-    return kinds["std_msgs/msg/Header"](stamp=kinds["builtin_interfaces/msg/Time"](sec=0, nanosec=0), frame_id=frame)
+    return kind("std_msgs/msg/Header")(stamp=kind("builtin_interfaces/msg/Time")(sec=0, nanosec=0), frame_id=frame)
 
 
-def pose(store: Any, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Any:
+def pose(kind: Kind, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Any:
     """Returns a pose of something level; x, y, z: metres; yaw: radians, anticlockwise from +x."""
-    kinds, half = store.types, yaw / 2
-    return kinds["geometry_msgs/msg/Pose"](
-        position=kinds["geometry_msgs/msg/Point"](x=x, y=y, z=z),
-        orientation=kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
+    half = yaw / 2
+    return kind("geometry_msgs/msg/Pose")(
+        position=kind("geometry_msgs/msg/Point")(x=x, y=y, z=z),
+        orientation=kind("geometry_msgs/msg/Quaternion")(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half)),
     )
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from travjax.config import InputError, require, to_json
 from travjax.data.dem import height_offsets, naming_file, read_rasters
 from travjax.files import sha256, user_path
-from travjax.rasters.raster import require_fine, require_known, survey
+from travjax.rasters.raster import Raster, Survey, require_fine, require_known, survey
 from travjax.rasters.reading_options import DemOptions
 from travjax.rasters.surface import Surface
 from travjax.simulation.grid import Grid
@@ -106,16 +106,9 @@ class SiteGround:
             rasters = read_rasters(path, reading, Grid(2 * nodes, nodes))
             require(len(rasters) == 1, "maps", len(rasters), "one for a site")
             raster = rasters[0]
-            require_fine(raster.cell_size, allow_coarse)
             if spacing is None and allow_coarse:
                 nodes = max(nodes, raster.cell_size)
-            if min(raster.heights.shape) < 2:
-                raise InputError(f"shape = {raster.heights.shape}: must be at least 2 x 2 values")
-            found = survey(raster.heights)
-            require_known(found.known)
-            offset = height_offsets([raster], [found])[0]
-            above = 0.0 if raster.height_offset is not None else offset
-            surface = Surface(raster, nodes, above, fill_holes and raster.height_offset is None)
+            surface, offset, found = _surface_of(raster, nodes, fill_holes, allow_coarse)
             checksum = sha256(path)
         return SiteGround(
             spacing=float(nodes),
@@ -140,6 +133,30 @@ class SiteGround:
         """Returns some rows and columns; NaN off the site. Raises InputError when the file cannot be read."""
         with naming_file(Path(self.path)):
             return self._surface.nodes(rows, cols)
+
+
+def ground_of(raster: Raster, spacing: float = 0.0625) -> ArrayGround:
+    """Returns the ground of a raster in memory, as `SiteGround.open` does that of a file.
+
+    spacing: metres between nodes
+    Raises InputError as that does.
+    """
+    surface, offset, _ = _surface_of(raster, spacing, fill_holes=True, allow_coarse=False)
+    rows, cols = surface.shape
+    heights = surface.nodes(slice(0, rows), slice(0, cols))
+    return ArrayGround(heights, offset, spacing, raster.origin, raster.crs, raster.frame)
+
+
+def _surface_of(raster: Raster, spacing: float, fill_holes: bool, allow_coarse: bool) -> tuple[Surface, float, Survey]:
+    """Returns the nodes of a raster, the metres that they count from, and what the raster holds."""
+    require_fine(raster.cell_size, allow_coarse)
+    if min(raster.heights.shape) < 2:
+        raise InputError(f"shape = {raster.heights.shape}: must be at least 2 x 2 values")
+    found = survey(raster.heights)
+    require_known(found.known)
+    offset = height_offsets([raster], [found])[0]
+    above = 0.0 if raster.height_offset is not None else offset
+    return Surface(raster, spacing, above, fill_holes and raster.height_offset is None), offset, found
 
 
 Site = ArrayGround | SiteGround

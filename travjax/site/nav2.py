@@ -31,7 +31,7 @@ def save_nav2(folder: Path, maps: Mapping[str, UInt8[np.ndarray, "r c"]], frame:
 
 
 def over_headings(costs: UInt8[np.ndarray, "h r c"]) -> dict[str, UInt8[np.ndarray, "r c"]]:
-    """Returns the worst, best and mean cost of each place over its known headings, row 0 in the north."""
+    """Returns the worst, best and mean cost of each place over its known headings, rows in the same order."""
     rows, cols = costs.shape[1:]
     maps = {name: np.empty((rows, cols), np.uint8) for name in ("worst", "best", "mean")}
     for top in range(0, rows, 256):
