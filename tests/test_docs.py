@@ -17,7 +17,8 @@ MADE = {"_build", "api", "records"}
 """Folders of docs/ that building the site fills."""
 PAGES = [
     path
-    for path in (*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("experiments/**/*.md"))
+    for where in ("*.md", "docs/**/*.md", "experiments/**/*.md", "examples/**/*.md")
+    for path in ROOT.glob(where)
     if not MADE & {*path.parts}
 ]
 README = ROOT / "README.md"
