@@ -45,20 +45,13 @@ gc.set_threshold(20_000, 20, 20)
 
 
 LONGEST = [
-    *("traversal/test_tyre.py", "commands/test_train.py", "test_cli.py", "traversal/test_traverse.py"),
-    *("test_jax_flags.py", "runs/test_predictor.py", "experiments/test_transfer.py", "training/test_trainer.py"),
-    *("simulation/test_events.py", "commands/test_evaluate.py", "resnet/test_imagenet_weights.py"),
-    *("resnet/test_convolution.py", "physics/test_physics.py", "terrain/test_styles.py", "commands/test_predict.py"),
-    *("estimators/test_map_estimator.py", "runs/test_checkpoint.py", "test_wheel.py", "resnet/test_network.py"),
-    *(
-        "planning/test_oracle.py",
-        "site/test_kernel.py",
-        "site/test_mapping.py",
-        "evaluation/test_map_figures.py",
-        "models/test_input_images.py",
-        "test_examples.py",
-        "test_docs.py",
-    ),
+    *("commands/test_train.py", "traversal/test_tyre.py", "traversal/test_traverse.py", "test_cli.py"),
+    *("test_jax_flags.py", "test_docs.py", "experiments/test_transfer.py", "runs/test_predictor.py"),
+    *("resnet/test_convolution.py", "resnet/test_imagenet_weights.py", "training/test_trainer.py"),
+    *("site/test_kernel.py", "site/test_mapping.py", "simulation/test_events.py", "commands/test_evaluate.py"),
+    *("resnet/test_network.py", "physics/test_physics.py", "terrain/test_styles.py", "commands/test_predict.py"),
+    *("estimators/test_map_estimator.py", "runs/test_checkpoint.py", "test_wheel.py", "planning/test_oracle.py"),
+    *("models/test_input_images.py", "evaluation/test_map_figures.py", "test_examples.py"),
 ]
 """Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
 

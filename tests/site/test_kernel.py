@@ -120,8 +120,8 @@ def test_a_tile_of_fine_nodes_has_fewer_places():
 
 @pytest.mark.parametrize("contact", ["nearest", "tyre"])
 def test_at_the_middle_of_a_map_a_primitive_is_a_trajectory(contact):
-    heights, actions = np.asarray(generate_terrain("rough", [3])[0]), ActionSpace()
-    chosen = [(0, 0, 0), (5, 3, 8), (11, 12, 1)]
+    heights, actions = np.asarray(generate_terrain("rough", [3])[0]), ActionSpace(turns=5, radii=(math.inf, 2.0, -1.5))
+    chosen = [(0, 0, 0), (3, 1, 2), (4, 2, 1)]
     arcs = [
         [(actions.radii[i], length) for i, length in zip(pair, actions.arc_lengths, strict=True)] for _, *pair in chosen
     ]
@@ -130,7 +130,7 @@ def test_at_the_middle_of_a_map_a_primitive_is_a_trajectory(contact):
     ]
     margins = simulate_site(heights, primitives=primitives, stride=0.5, contact=contact)
     trajectories = [int(actions.index(*one)) for one in chosen]
-    expected = simulate(heights, contact=contact, turn=False)
+    expected = simulate(heights, actions=actions, contact=contact, turn=False)
     middle = Grid().cells // 2 // 8
     for name in ("step", "obstacle", "tilt"):
         np.testing.assert_allclose(margins[name][:, middle, middle], expected[name][np.array(trajectories)], atol=2e-6)

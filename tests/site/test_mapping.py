@@ -200,21 +200,18 @@ def test_arrays_in_memory_are_the_same(mapped, site_file):
 
 def test_arrays_that_know_where_they_lie_are_mapped_there():
     ground = ArrayGround(np.zeros((30, 40), np.float32), 812.0, 0.1, (5.0, 6.0), "EPSG:32632")
-    found = map_site(ground, "leo_rover", headings=1)
+    found = map_site(ground, "leo_rover", headings=1, contact="nearest")
     assert found.x[:2] == pytest.approx([5.0, 5.3]) and found.y[0] == 6.0 and found.crs == "EPSG:32632"
     assert (found.heights == 812.0).all() and (found.bands["known_headings"] == 1).any()
-    plain = map_site(np.zeros((30, 40)), "leo_rover", headings=1, spacing=0.1)
+    plain = map_site(np.zeros((30, 40)), "leo_rover", headings=1, spacing=0.1, contact="nearest")
     assert plain.x[:2] == pytest.approx([0.0, 0.3]) and plain.crs is None
 
 
-def test_xarray_gets_names_and_coordinates():
+def test_xarray_gets_names_and_coordinates_and_its_absence_is_named(monkeypatch):
     pytest.importorskip("xarray", reason="xarray is not installed")
-    data = map_site(np.zeros((40, 50)), headings=4).to_xarray()
+    found = map_site(np.zeros((40, 40)), headings=4, contact="nearest")
+    data = found.to_xarray()
     assert data["cost"].dims == ("heading", "y", "x") and data["heading"].values.tolist() == [0, 90, 180, 270]
-
-
-def test_a_missing_xarray_is_named(monkeypatch):
-    found = map_site(np.zeros((40, 50)), "leo_rover", headings=1)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r'^xarray: not installed; needed: pip install "travjax\[xarray\]"$'):
         found.to_xarray()
@@ -283,7 +280,7 @@ def test_what_is_unfinished_of_another_setup_is_not_used(site_file, tmp_path):
 
 def test_coarse_cells_are_refused_unless_allowed_and_then_explained(tmp_path):
     np.savez(tmp_path / "coarse.npz", heights=np.zeros((40, 40)), cell_size=0.5)
-    words = ("map", tmp_path / "coarse.npz", "--out", tmp_path / "out", "--headings", 2)
+    words = ("map", tmp_path / "coarse.npz", "--out", tmp_path / "out", "--headings", 2, "--contact", "nearest")
     code, _, err = run_words(*words)
     assert code == 2 and "cell_size = 0.5: must be at most 0.125 m (--allow-coarse takes it)" in err
     code, text, err = run_words(*words, "--allow-coarse")
@@ -339,7 +336,8 @@ def test_the_site_itself_is_not_overwritten(site_file, tmp_path):
 @pytest.mark.parametrize(("shape", "cell"), [((2, 96), 0.0625), ((40, 40), 0.2)])
 def test_narrow_lattices_and_coarse_cells_are_mapped(tmp_path, shape, cell):
     np.savez(tmp_path / "site.npz", heights=np.zeros(shape), cell_size=cell, origin=(2.0, 3.0))
-    code, _, err = run_words("map", tmp_path / "site.npz", "--headings", 1, "--allow-coarse", "--out", tmp_path / "out")
+    words = ("map", tmp_path / "site.npz", "--headings", 1, "--contact", "nearest", "--allow-coarse")
+    code, _, err = run_words(*words, "--out", tmp_path / "out")
     assert code == 0, err
     _, said = decoded(tmp_path / "out/nav2/best.yaml")
     stride = 0.25 if cell < 0.1 else 0.4
@@ -350,17 +348,8 @@ def test_a_recording_keeps_its_frame_and_its_heights(tmp_path):
     pytest.importorskip("rosbags", reason="the extra ros is not installed")
     ground = np.full((50, 60), 1834.25, np.float32)
     write_grid_map(tmp_path / "in.mcap", {"z": ground}, 0.0625, (1.0, 2.0), "odom")
-    words = (
-        "map",
-        tmp_path / "in.mcap",
-        "--headings",
-        1,
-        "--out",
-        tmp_path / "out",
-        "--grid-map",
-        tmp_path / "out.mcap",
-    )
-    code, _, err = run_words(*words)
+    words = ("map", tmp_path / "in.mcap", "--headings", 1, "--contact", "nearest", "--out", tmp_path / "out")
+    code, _, err = run_words(*words, "--grid-map", tmp_path / "out.mcap")
     assert code == 0, err
     raster = read_grid_map(tmp_path / "out.mcap", DemOptions(layer="elevation"))
     assert raster.frame == "odom" and raster.origin == pytest.approx((1.0, 2.0))

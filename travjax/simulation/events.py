@@ -84,7 +84,8 @@ class Event:
 
 def larger(a: jax.Array, b: jax.Array) -> jax.Array:
     """Returns the larger of two numbers with one instruction; jnp.maximum also checks for NaN."""
-    return jnp.where(a > b, a, b)
+    a, b = jnp.broadcast_arrays(a, b)
+    return jax.lax.select(a > b, a, b)  # jnp.where is a function of its own wherever it is called: slow to compile
 
 
 def _stepping_node(pose: Pose) -> jax.Array:
