@@ -198,8 +198,11 @@ def create(config: FieldConfig = FieldConfig(), seed: int = 0, events: int = len
 
 def _window_means(elevation: Float[Array, "b rows cols"]) -> Float[Array, "b rows cols"]:
     """Averages the RELIEF x RELIEF nodes around each node, with the map's edge repeated."""
-    edge = RELIEF // 2
-    padded = jnp.pad(elevation, ((0, 0), (edge, edge), (edge, edge)), mode="edge")
+    edge, padded = RELIEF // 2, elevation
+    for axis in (1, 2):  # jnp.pad would do the same, but is not exported to ONNX as it should be
+        first = lax.slice_in_dim(padded, 0, 1, axis=axis)
+        last = lax.slice_in_dim(padded, -1, None, axis=axis)
+        padded = jnp.concatenate([first] * edge + [padded] + [last] * edge, axis)
     return lax.reduce_window(padded, 0.0, lax.add, (1, RELIEF, RELIEF), (1, 1, 1), "VALID") / RELIEF**2
 
 

@@ -127,6 +127,8 @@ def _simulate(
     where: bool = False,
 ) -> tuple[Margins, Where | None]:
     grid = layout.grid
+    # In the code of a caller these are constants: XLA would compute with them beforehand, with other last bits.
+    chunks, wheelbase, track = jax.lax.optimization_barrier((chunks, wheelbase, track))
     by_node = node_lanes(above_centre(maps, grid))
     views = view_lanes(by_node, layout)
 

@@ -106,6 +106,8 @@ def _simulate(
     maps, chunks: TyreChunks, source, turns: _Turns | None, robot: Robot, layout: Layout, where: bool
 ) -> tuple[Margins, Where | None]:
     grid, events = layout.grid, robot.events
+    # In the code of a caller tables are constants: XLA would compute with them beforehand, with other last bits.
+    chunks, turns = jax.lax.optimization_barrier((chunks, turns))
     lanes = [node_lanes(field) for field in fields(above_centre(maps, grid), robot, grid.spacing)]
     ground, views = Ground(*lanes), Ground(*(view_lanes(field, layout) for field in lanes))
 
