@@ -40,6 +40,7 @@ $(VENV)/.ready: pyproject.toml constraints.txt
 	echo "Setting up $(VENV) with $$found, about a minute ..."; \
 	rm -rf $(VENV) && $$found -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --no-deps jax2onnx
 	@touch $@
 
 label: setup

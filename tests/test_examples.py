@@ -2,10 +2,17 @@
 
 import importlib.util
 import re
+import runpy
+import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
+
+from tests.small_training import SETUP, dataset
+from travjax.exporting.stablehlo import export_simulator
+from travjax.traversal.traverse import label
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -57,7 +64,8 @@ def words(text: str) -> list[str]:
 
 
 def test_every_example_is_tested():
-    assert {path.stem for path in EXAMPLES.glob("*.py")} == {"label_dem", "own_robot", "paper_figure", "train_field"}
+    tested = {"label_dem", "own_robot", "paper_figure", "run_exported", "train_field"}
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == tested
 
 
 def test_a_dem_is_labelled(capsys):
@@ -93,3 +101,18 @@ def test_a_field_is_trained_and_compared(capsys, tmp_path):
     assert words(out) == words("\n".join(said))
     simulator, _, field = (float(score) for score in re.findall(r"(\d\.\d+)$", out, re.MULTILINE))
     assert simulator < 0.5 < field
+
+
+def test_an_exported_file_runs_without_travjax(capsys, monkeypatch):
+    export_simulator("it.stablehlo", SETUP)
+    np.save("heights.npy", dataset().heights[:3])
+    source = EXAMPLES / "run_exported.py"
+    monkeypatch.setattr(sys, "argv", [source.name, "it.stablehlo", "heights.npy"])
+    failed = runpy.run_path(str(source))["results"]["failed"]
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == "simulator, contact model nearest for Husky A200"
+    assert said[5] == f"limits: {list(SETUP.robot.limits)}" and said[7].startswith("failed: [b, 18, 3] bool")
+    np.testing.assert_array_equal(failed, label(dataset().heights[:3], SETUP.robot, SETUP.actions, grid=SETUP.grid))
+    lines = source.read_text().splitlines()
+    imports = [line for line in lines if re.match("(import|from) ", line)]
+    assert len(lines) <= 20 and imports and not any("travjax" in line for line in imports)

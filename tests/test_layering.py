@@ -23,6 +23,7 @@ LAYERS = {
     "site": "primitives ground kernel costs tiling geotiff nav2 store site_figures mapping geometric site_benchmark",
     "estimators": "names preset inference kind trajectory_samples map_samples trajectory_estimator map_estimator",
     "runs": "quiet_orbax checkpoint run_log run model_file model_card predictor prediction_report evaluator",
+    "exporting": "functions exported_file stablehlo onnx_graph",
     "planning": "biarcs motions path judges costs endpoints search no_path planner to_go field_judge action_space",
     "plan_results": "path_files route_graph plan_figures plan_report plan_benchmark",
     "navigation": "tasks methods trials scores",

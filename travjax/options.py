@@ -1,6 +1,7 @@
 """Options that commands and experiments share, in groups, and the typed values that they stand for."""
 
 import argparse
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -68,13 +69,13 @@ def add_world(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_robot_alone(parser: argparse.ArgumentParser) -> None:
+def add_robot_alone(parser: Options) -> None:
     """Adds the option for the robot."""
     presets = ", ".join(Robot.presets())
     parser.add_argument("--robot", default="seekur_jr", metavar="R", help=f"{presets}, or a .toml file (seekur_jr)")
 
 
-def add_robot(parser: argparse.ArgumentParser) -> None:
+def add_robot(parser: Options) -> None:
     """Adds the options for robot and action space; see `setup`."""
     add_robot_alone(parser)
     parser.add_argument("--actions", type=user_path, metavar="FILE", help=".toml file of an action space (the paper's)")
@@ -106,9 +107,10 @@ GROWS = "features of synthetic maps grow with it, unless a world is given"
 """Help text on the effect of a map's size."""
 
 
-def add_grid(parser: Options) -> None:
-    """Adds the options for size and spacing of maps; see `setup`."""
-    parser.add_argument("--size", type=float, default=8.0, metavar="M", help=f"edge of a map in metres (8); {GROWS}")
+def add_grid(parser: Options, of_synthetic: bool = True) -> None:
+    """Adds the options for size and spacing of maps; see `setup`; of_synthetic: whether some may be synthetic."""
+    effect = f"; {GROWS}" if of_synthetic else ""
+    parser.add_argument("--size", type=float, default=8.0, metavar="M", help=f"edge of a map in metres (8){effect}")
     parser.add_argument(
         "--spacing", type=float, default=0.0625, metavar="M", help="metres between nodes of a map (0.0625)"
     )
@@ -281,6 +283,18 @@ def require_left_out(arguments: argparse.Namespace, name: str, here: bool, where
     given = getattr(arguments, name)
     none = given is None or given is False
     require(none or not here, f"--{name.replace('_', '-')}", str(given), f"left out {where}")
+
+
+def require_default(
+    arguments: argparse.Namespace, defaults: Mapping[str, object], names: Iterable[str], where: str
+) -> None:
+    """Raises InputError if an option has another value than its default where it has no effect.
+
+    defaults: of options by name; where: in words, as in "--check is given"
+    """
+    for name in names:
+        given = getattr(arguments, name)
+        require(given == defaults[name], f"--{name.replace('_', '-')}", given, f"left out where {where}")
 
 
 def maps(arguments: argparse.Namespace, grid: Grid) -> MapStream:

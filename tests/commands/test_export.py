@@ -1,5 +1,6 @@
 """`travjax export`: the file, its model card, and the one line for each bad input."""
 
+import json
 import re
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 
 from tests.commandline import FEW, files, run_words
 from tests.field_runs import CONFIG
-from tests.small_training import copy, dataset, host, require_equal
+from tests.small_training import GRID_WORDS, copy, dataset, host, require_equal
 from travjax.models.variables import split_model
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.model_card import card
@@ -172,3 +173,46 @@ def test_a_folder_that_is_not_there_is_one_line(field, tmp_path):
     to = tmp_path / "none/it.safetensors"
     assert refusal(field, "--to", to).startswith(f"{to}: cannot be written: No such file or directory")
     assert files(tmp_path) == set()
+
+
+# ---- Files that run without travjax
+
+
+def test_the_field_and_the_simulator_are_exported_with_their_descriptions(field, tmp_path, few):
+    simulator = ("--robot", "husky_a200", "--actions", few, *GRID_WORDS, "--contact", "nearest")
+    exports = {
+        "field": (field, "--stablehlo", "--checkpoint", "latest"),
+        "it": ("--simulator", *simulator),
+    }
+    for name, words in exports.items():
+        to = tmp_path / f"{name}.stablehlo"
+        code, out, err = run_words("export", *words, "--to", to)
+        assert (code, out) == (0, f"{to}\n{to}.json\n"), err
+    assert len(files(tmp_path)) == 4
+    function = [json.loads((tmp_path / f"{name}.stablehlo.json").read_text())["function"] for name in exports]
+    assert function == ["field, run", "simulator, contact model nearest"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--to", "it.safetensors"), "MODEL: left out; needed: the folder of a training run, or --stablehlo or --onnx"),
+        (("--stablehlo", "--to", "it.onnx"), "--to it.onnx: must be a .stablehlo file"),
+        (("--onnx", "--to", "it.stablehlo"), "--to it.stablehlo: must be a .onnx file"),
+        (("--simulator", "--to", "it.json"), "--to it.json: must be a .stablehlo file"),
+        (("run", "--simulator", "--to", "it.stablehlo"), "MODEL = 'run': must be left out with --simulator"),
+        (
+            ("--onnx", "--robot", "leo_rover", "--to", "it.onnx"),
+            "--robot = 'leo_rover': must be left out where --simulator is not given",
+        ),
+        (("--onnx", "--no-turn", "--to", "it.onnx"), "--no-turn = 'given': must be left out where --simulator is not"),
+        (("--stablehlo", "--to", "no/such/it.stablehlo"), "no/such/it.stablehlo: cannot be written: No such file or"),
+    ],
+)
+def test_what_does_not_fit_together_ends_with_one_line(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert refusal(*words).startswith(said) and not files(tmp_path)
+
+
+def test_one_format_is_written_at_a_time(tmp_path):
+    assert "not allowed with argument --onnx" in refusal("--onnx", "--simulator", "--to", tmp_path / "it.onnx")

@@ -1,7 +1,6 @@
 """`travjax dataset`: maps with all their labels and splits, synthetic or real, kept in one folder."""
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -94,7 +93,7 @@ def run(arguments: argparse.Namespace) -> None:
     folder = arguments.check or arguments.out
     statistics = folder.parent / f"{folder.name}_statistics.txt"  # the folder holds only the data set
     if arguments.check:
-        _require_left_out(arguments, MAKING, "--check is given")
+        options.require_default(arguments, arguments.making, MAKING, "--check is given")
     else:
         require_replaceable(statistics, are_statistics, f"--out {folder}", "table")
     if arguments.tfds:
@@ -118,11 +117,11 @@ def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
     """Makes and saves the data set that the options describe."""
     files = bool(arguments.dem or arguments.held_out)
     if arguments.sites:
-        _require_left_out(arguments, (*SYNTHETIC, "dem", "held_out", *REAL), "--sites is given")
+        options.require_default(arguments, arguments.making, (*SYNTHETIC, "dem", "held_out", *REAL), "--sites is given")
     elif files:
-        _require_left_out(arguments, SYNTHETIC, "DEM files are given")
+        options.require_default(arguments, arguments.making, SYNTHETIC, "DEM files are given")
     else:
-        _require_left_out(arguments, REAL, "no DEM file is given")
+        options.require_default(arguments, arguments.making, REAL, "no DEM file is given")
     named = SitesConfig.load(find_preset(arguments.sites, "sites")) if arguments.sites else None
     real = _sites(arguments) if files else named
     synthetic = None if real else DatasetConfig(*(getattr(arguments, name) for name in SYNTHETIC))
@@ -133,12 +132,6 @@ def _made(arguments: argparse.Namespace, folder: Path) -> Dataset:
     return build_synthetic(synthetic, setup, folder)
 
 
-def _require_left_out(arguments: argparse.Namespace, names: Sequence[str], where: str) -> None:
-    for name in names:
-        given = getattr(arguments, name)
-        require(given == arguments.making[name], f"--{name.replace('_', '-')}", given, f"left out where {where}")
-
-
 def _sites(arguments: argparse.Namespace) -> SitesConfig:
     """Returns the sites of DEM files."""
     windows = options.windows(arguments)
@@ -147,7 +140,7 @@ def _sites(arguments: argparse.Namespace) -> SitesConfig:
         name: _strip(name, getattr(arguments, name)) for name in ("test_strip", "validation_strip")
     }
     if not arguments.dem:
-        _require_left_out(arguments, tuple(strips), "no --dem file is given")
+        options.require_default(arguments, arguments.making, tuple(strips), "no --dem file is given")
     given = {name: getattr(arguments, name) for name in ("gap", "max_unknown")}
     return SitesConfig(
         (

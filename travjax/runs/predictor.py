@@ -55,6 +55,12 @@ class Predictor:
             f"{run.grid.spacing:g} m)"
         )
 
+    @property
+    def title(self) -> str:
+        """What it is and the name of its file or folder, as in "field, laptop"."""
+        model = self.run.preset.model
+        return f"{model}, {self.source.name}" if self.source else model
+
     @staticmethod
     @usual_flags()
     def load(source: str | Path | None = None, which: str = "best") -> "Predictor":

@@ -1,0 +1,68 @@
+"""The field that comes with the package as ONNX: what onnxruntime computes, and what is refused."""
+
+import importlib.util
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from tests.exporting.test_stablehlo import loaded
+from tests.field_runs import RUN, estimator
+from travjax.config import InputError
+from travjax.exporting import onnx_graph
+from travjax.exporting.onnx_graph import EXPORTER, TOLERANCE, export_onnx
+from travjax.exporting.stablehlo import export_field
+from travjax.runs.predictor import Predictor
+
+onnxruntime = pytest.importorskip("onnxruntime")
+pytest.importorskip("jax2onnx", reason=f"install it: pip install --no-deps {EXPORTER}")
+
+pytestmark = pytest.mark.usefixtures("shared_code")
+
+
+@pytest.fixture(scope="module")
+def heights(maps) -> np.ndarray:
+    """Three terrains, the last with unknown nodes."""
+    return np.stack([maps[name] for name in ("rough", "scattered_sharp", "holes")])
+
+
+@pytest.fixture(scope="module")
+def predictor() -> Predictor:
+    return Predictor.load()
+
+
+def test_the_packaged_field_predicts_the_same_as_onnx_and_as_stablehlo(predictor, heights, tmp_path):
+    wanted = predictor.predict(heights)
+    path, _ = export_onnx(tmp_path / "field.onnx", predictor)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    names = [output.name for output in session.get_outputs()]
+    found = dict(zip(names, session.run(None, {"heights": heights}), strict=True))
+    exported = jax.jit(loaded(export_field(tmp_path / "field.stablehlo", predictor)[0]).call)(heights)
+    for tolerance, arrays in ((TOLERANCE, found), (1e-6, exported)):
+        np.testing.assert_allclose(arrays["probability"], wanted.probability, rtol=0, atol=tolerance)
+        np.testing.assert_allclose(arrays["margin"], wanted.margins, rtol=0, atol=tolerance)
+    alone = session.run(["probability"], {"heights": heights[2:]})[0]
+    np.testing.assert_allclose(alone, wanted.probability[2:], rtol=0, atol=TOLERANCE)
+    assert path.stat().st_size < 20e6
+    said = json.loads((tmp_path / "field.onnx.json").read_text())
+    assert said["function"] == "field, field_seekur_jr.safetensors" and set(said["outputs"]) == set(names)
+
+
+def test_a_graph_that_computes_something_else_is_not_written(monkeypatch, tmp_path):
+    monkeypatch.setattr(onnx_graph, "largest_error", lambda graph, predictor: np.nan)
+    with pytest.raises(InputError, match="is off by nan; allowed: up to 1e-05"):
+        export_onnx(tmp_path / "it.onnx", Predictor(RUN, estimator()))
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("missing", "needed"),
+    [("onnx_ir", 'pip install "travjax[onnx]"'), ("jax2onnx", f"pip install --no-deps {EXPORTER}")],
+)
+def test_a_library_that_is_missing_is_named(monkeypatch, tmp_path, missing, needed):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == missing else find(name))
+    with pytest.raises(InputError) as raised:
+        export_onnx(tmp_path / "it.onnx", Predictor(RUN, estimator()))
+    assert str(raised.value).endswith(f"not installed; needed: {needed}")
