@@ -27,7 +27,7 @@ PACKAGES = [
     {"commands": "parse, call the library, print", "experiments": "the paper's, and a comparison"},
     {"training": "the trainer and its step; evaluation on test maps", "physics": "trajectories driven in MuJoCo"},
     {"navigation": "plan on what a sensor saw, drive on the truth", "plan_results": "files and figures of paths"},
-    {"planning": "paths on whole sites, or why there is none"},
+    {"planning": "paths on whole sites, or why there is none", "exporting": "StableHLO and ONNX files"},
     {"runs": "a run on disk: checkpoints, model file, predictors"},
     {"estimators": "presets, samples, losses", "site": "maps of whole sites"},
     {"evaluation": "scores, tables, figures"},

@@ -14,7 +14,7 @@ function = jax.jit(export.deserialize(bytearray(Path(file).read_bytes())).call)
 results = function(np.load(heights).astype(np.float32))
 
 print(f"{about['function']} for {about['robot']['name']}")
-for name in ("grid", "actions", "contact", "events", "limits", "travjax"):
+for name in ("grid", "actions", "contact", "events", "limits", "travjax", "jax"):
     print(f"{name}: {about[name]}")
 for name, array in results.items():
     print(f"{name}: {about['outputs'][name]}; here {list(array.shape)}, mean {np.nanmean(array):.3f}")

@@ -111,7 +111,7 @@ def test_an_exported_file_runs_without_travjax(capsys, monkeypatch):
     failed = runpy.run_path(str(source))["results"]["failed"]
     said = capsys.readouterr().out.splitlines()
     assert said[0] == "simulator, contact model nearest for Husky A200"
-    assert said[5] == f"limits: {list(SETUP.robot.limits)}" and said[7].startswith("failed: [b, 18, 3] bool")
+    assert said[5] == f"limits: {list(SETUP.robot.limits)}" and said[8].startswith("failed: [b, 18, 3] bool")
     np.testing.assert_array_equal(failed, label(dataset().heights[:3], SETUP.robot, SETUP.actions, grid=SETUP.grid))
     lines = source.read_text().splitlines()
     imports = [line for line in lines if re.match("(import|from) ", line)]

@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import jax
+
 from travjax.config import InputError
 from travjax.files import atomic_write, require_replaceable, save_text, sha256
 from travjax.simulation.setup import Setup
@@ -33,6 +35,7 @@ def write(to: Path, data: bytes, setup: Setup, source: str, outputs: dict[str, s
         events=setup.robot.event_names,
         limits=setup.robot.limits,
         trajectories=len(setup.actions),
+        jax=jax.__version__,
         sha256=sha256(to),
     )
     return to, save_text(_beside(to), f"{described}\n")
