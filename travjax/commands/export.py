@@ -58,6 +58,8 @@ def run(arguments: argparse.Namespace) -> None:
             raise InputError("MODEL: left out; needed: the folder of a training run, or --stablehlo or --onnx")
         progress.wrote(*export_run(arguments.model, arguments.to, checkpoint))
         return
+    of_folder = arguments.model is not None and arguments.model.is_dir()
+    options.require_left_out(arguments, "checkpoint", not of_folder, "where MODEL is no folder")
     from travjax.exporting.onnx_graph import export_onnx
     from travjax.exporting.stablehlo import export_field
     from travjax.runs.predictor import Predictor
