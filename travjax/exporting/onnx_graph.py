@@ -27,7 +27,7 @@ SUFFIX = ".onnx"
 EXPORTER = "jax2onnx==0.17.1"
 
 OPSET = 18
-"""Version of the operators, which onnxruntime knows from 1.18 on."""
+"""Version of the operators: an old one, for programs that are old."""
 
 NAMES = ("margin", "probability")
 """Results in the order of the file, which is that of their names."""
