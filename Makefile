@@ -5,6 +5,8 @@ OUT ?= runs
 PRESET ?= laptop
 MODEL ?= resnet50
 WEIGHTS ?=
+TIME ?= 840
+SCALE := $(if $(filter file,$(origin PRESET)),paper,$(PRESET))
 RUN := $(OUT)/$(if $(filter field,$(MODEL)),field,train)/$(PRESET)
 EXTRAS ?= dev
 TRAVJAX_DATA ?= $(wildcard ../shared/data)
@@ -12,7 +14,7 @@ YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
 export TRAVJAX_DATA
 
 .DEFAULT_GOAL := help
-.PHONY: help setup label train test check bench docs clean
+.PHONY: help setup label train gpu own-python test check bench docs clean
 
 help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
@@ -21,6 +23,9 @@ help:
 	@echo "             MODEL=resnet50|field ($(MODEL)); resnet50 begins with ImageNet weights: WEIGHTS=FILE, those of"
 	@echo "             TRAVJAX_DATA or of the cache, else they are fetched (95 MB); WEIGHTS=none for random ones"
 	@echo "             on an NVIDIA GPU: make clean, then make train PRESET=paper EXTRAS=dev,cuda"
+	@echo "make gpu     on an NVIDIA GPU, measure, train and evaluate as much as fits into TIME seconds ($(TIME)), into"
+	@echo "             $(OUT)/gpu; again goes on; PRESET=smoke|paper (paper), WEIGHTS as above; EXTRAS=cuda installs JAX"
+	@echo "             for it, BIN=DIR takes the programs of a Python that has everything and needs no network"
 	@echo "make test    run the tests"
 	@echo "make check   lint, types and layering"
 	@echo "make bench   measure speed, into $(OUT)/bench"
@@ -60,6 +65,13 @@ train: setup
 	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
 	@echo "The hazard field: make train MODEL=field PRESET=smoke (1 minute), PRESET=laptop (an hour); it needs no ImageNet weights."
 	@echo "Another robot: $(BIN)/travjax train $(PRESET) --model $(MODEL) --robot husky_a200 --out DIR"
+
+# With a BIN of its own nothing is fetched: that Python has the dependencies and JAX for the GPU.
+gpu: $(if $(filter $(VENV)/bin,$(BIN)),setup,own-python)
+	$(BIN)/python -m travjax.experiments.gpu $(SCALE) --time $(TIME) $(if $(WEIGHTS),--weights $(WEIGHTS)) --out $(OUT)/gpu/$(SCALE)
+
+own-python:
+	$(BIN)/python -m pip install --quiet --no-deps --no-index --no-build-isolation --editable .
 
 test: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder

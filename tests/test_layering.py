@@ -32,6 +32,7 @@ LAYERS = {
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "
     "timing comparison physics navigation",
+    "experiments.gpu": "limits config programs kernels estimate parts __main__",
     "commands": "terrain label map plan dataset weights train evaluate export predict physics bench",
     "program": "cli",
 }

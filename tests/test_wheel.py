@@ -118,6 +118,7 @@ from pathlib import Path
 import travjax
 from travjax.config import load_toml
 from travjax.data.provenance import SitesConfig
+from travjax.experiments.gpu.config import GpuConfig
 from travjax.experiments.physics import PhysicsExperiment
 from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
@@ -125,7 +126,7 @@ from travjax.navigation.tasks import NavigationConfig
 from travjax.estimators.preset import Preset
 
 kinds = {{"physics": PhysicsExperiment, "sites": SitesConfig, "transfer": TransferConfig}} | {{
-    "navigation": NavigationConfig
+    "navigation": NavigationConfig, "gpu": GpuConfig
 }}
 for kind, name in {names}:
     path = find_preset(name, kind)

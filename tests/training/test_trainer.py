@@ -2,7 +2,9 @@
 
 import errno
 import math
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -46,6 +48,7 @@ from travjax.runs import checkpoint
 from travjax.runs.checkpoint import load_meta
 from travjax.runs.run import load_estimator
 from travjax.simulation.events import EVENTS
+from travjax.training import trainer as trainer_module
 from travjax.training.step import StepSettings, update
 from travjax.training.trainer import Trainer
 from travjax.traversal.traverse import unpacked
@@ -242,6 +245,22 @@ def test_features_of_another_run_of_the_same_trunk_may_be_given(tmp_path, monkey
 # ---- Watched samples
 
 
+@pytest.mark.parametrize("until", [7, 10, 14])
+def test_training_that_runs_out_of_time_goes_on_to_the_same_numbers(trained, tmp_path, monkeypatch, until):
+    first = begun(tmp_path)
+    clock = SimpleNamespace(monotonic=lambda: first.position.total, perf_counter=time.perf_counter)
+    monkeypatch.setattr(trainer_module, "time", clock)
+    assert not first.train(until) and not first.train(until)
+    assert first.position.total == until
+    monkeypatch.undo()
+    second = trainer(tmp_path)
+    second.resume()
+    assert second.position == first.position
+    assert second.train() and second.finished
+    assert rows_of(tmp_path) == rows_of(trained)
+    require_equal(saved_state(tmp_path), saved_state(trained))
+
+
 def eval_sets() -> dict[str, tuple]:
     """All trajectories of two test maps, and of one."""
     test = dataset().maps_of("test")
@@ -253,7 +272,8 @@ def test_eval_sets_are_scored_before_training_and_after_each_epoch(tmp_path, pha
     made = Trainer(run_of(**phases), dataset(), tmp_path, Devices.all(), quiet=True, eval_sets=eval_sets())
     made.start(create(PRESET.trunk, PRESET.heads, 0))
     states = [host(made._variables)]
-    made._train_epoch, train = lambda: (train(), states.append(host(made._variables))), made._train_epoch
+    kept = lambda until: (train(until), states.append(host(made._variables)))
+    made._train_epoch, train = kept, made._train_epoch
     made.train()
     rows = [row for row in rows_of(tmp_path) if "eval_sets" in row]
     assert [row["epoch"] for row in rows] == [0, 1, 2]

@@ -110,19 +110,28 @@ def write_rows(rows: list[dict], columns: dict[str, str], path: Path) -> None:
 def kernel_rows(setup: Setup, repeats: int) -> Iterator[dict]:
     """Measures terrain, and labelling by each contact model, on compiled code; yields a row for each batch size."""
     for maps in BATCHES:
-        styles, seeds = _mixture(0, maps)
-        make = lambda styles=styles, seeds=seeds: generate_terrain(styles, seeds, grid=setup.grid)
-        yield _timed("terrain", maps, make, repeats, 0)
+        yield terrain_row(maps, setup, repeats)
     for contact in CONTACTS:
         for maps in BATCHES:
             yield labelling_row(maps, replace(setup, contact=Contact.from_model(contact)), repeats)
 
 
+def terrain_row(maps: int, setup: Setup, repeats: int) -> dict:
+    """Measures making this many maps at once, on compiled code."""
+    styles, seeds = _mixture(0, maps)
+    return _timed("terrain", maps, lambda: generate_terrain(styles, seeds, grid=setup.grid), repeats, 0)
+
+
 def labelling_row(maps: int, setup: Setup, repeats: int) -> dict:
     """Measures labelling of this many maps at once, on compiled code."""
-    heights = generate_terrain(*_mixture(0, maps), grid=setup.grid)
-    heights = heights[0] if maps == 1 else heights
+    made = mixed_maps(maps, setup)
+    heights = made[0] if maps == 1 else made
     return _timed(LABELLING[setup.contact.model], maps, lambda: margins_of(heights, setup), repeats, len(setup.actions))
+
+
+def mixed_maps(maps: int, setup: Setup) -> jax.Array:
+    """Makes maps [n, rows, cols] of all styles in turn."""
+    return generate_terrain(*_mixture(0, maps), grid=setup.grid)
 
 
 def reference_row(setup: Setup, on_progress: Callable[[int], object], repeats: int = 1) -> dict:
@@ -186,13 +195,19 @@ def _mixture(first: int, count: int) -> tuple[list[str], range]:
     return [STYLES[number % len(STYLES)] for number in range(first, first + count)], range(first, first + count)
 
 
-def _timed(what: str, maps: int, run: Callable[[], object], repeats: int, trajectories: int) -> dict:
+def median_time(run: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Returns the median seconds of `repeats` calls whose results are ready, and those of the call before them."""
     seconds = []
     for _ in range(repeats + 1):
         start = time.perf_counter()
         jax.block_until_ready(run())
         seconds.append(time.perf_counter() - start)
-    return _row(what, maps, statistics.median(seconds[1:]), trajectories, seconds[0], repeats)
+    return statistics.median(seconds[1:]), seconds[0]
+
+
+def _timed(what: str, maps: int, run: Callable[[], object], repeats: int, trajectories: int) -> dict:
+    seconds, first = median_time(run, repeats)
+    return _row(what, maps, seconds, trajectories, first, repeats)
 
 
 def _row(

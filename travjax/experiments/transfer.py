@@ -6,7 +6,8 @@ under experiments/transfer.
 
 import argparse
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,28 +92,54 @@ def run(arguments: argparse.Namespace) -> None:
     path = find_preset(arguments.preset + suffix, "transfer")
     out = arguments.out or Path("runs/transfer") / path.stem
     with held(out), going_on(launch.GOES_ON):
-        _run(path, out, arguments)
+        experiment(
+            path,
+            out,
+            lambda preset: _base(preset, arguments),
+            arguments.synthetic,
+            data=arguments.data,
+            stand_ins=arguments.stand_ins,
+        )
 
 
-def _run(path: Path, out: Path, arguments: argparse.Namespace) -> None:
-    """Runs the experiment of a preset in a folder that no other process uses."""
+def experiment(
+    path: Path,
+    out: Path,
+    base_of: Callable[[Path], Run],
+    synthetic: Path | None = None,
+    *,
+    data: Path | None = None,
+    stand_ins: bool = False,
+    until: float = math.inf,
+) -> bool:
+    """Runs the experiment of a preset in a folder that no other process uses.
+
+    base_of:   makes the run of the synthetic model from the preset that trains it
+    synthetic: folder of the synthetic model, which is trained unless given
+    data:      data set of real maps, instead of that of the sites; stand_ins: whether built-in sites take their place
+    until:     `time.monotonic()` after which no step of the arms begins; the seeds that have ended by then are reported
+    Returns whether all seeds have ended.
+    """
     config = load_toml(path, TransferConfig)
     sites = path.parent / user_path(config.sites)
-    stand_ins = chosen_stand_ins(sites, out, arguments.stand_ins, arguments.data)
-    if stand_ins:
-        print(stand_ins.sentence, flush=True)
-        config = stand_ins.in_place_of_real(config)
+    places = chosen_stand_ins(sites, out, stand_ins, data)
+    if places:
+        print(places.sentence, flush=True)
+        config = places.in_place_of_real(config)
     devices = Devices.all()
     _require_same(out, config)
-    base = _base(path.parent / user_path(config.synthetic), arguments)
-    synthetic = arguments.synthetic or out / "synthetic"
-    data = _data(sites, arguments.data, base, out, stand_ins)
+    base = base_of(path.parent / user_path(config.synthetic))
+    windows = _data(sites, data, base, out, places)
     # Before hours of work, as it raises where something does not fit.
-    transfer = Transfer(config, base, synthetic, data, out, devices)
-    if not arguments.synthetic:
-        _train_synthetic(base, synthetic, devices)
+    transfer = Transfer(config, base, synthetic or out / "synthetic", windows, out, devices)
+    if not synthetic:
+        _train_synthetic(base, transfer.synthetic, devices)
     say = lambda arm, seed: progress.say(f"\n{arm}, seed {seed}: {transfer.place_of(arm, seed)}")
-    _write(transfer, Results.from_rows(run_all(transfer, say)), out, stand_ins)
+    rows = run_all(transfer, say, until)
+    ended = len(rows[transfer.arms[0]])
+    if ended:
+        _write(transfer, Results.from_rows(rows), out, places)
+    return ended == len(config.seeds)
 
 
 def _require_same(out: Path, config: TransferConfig) -> None:
@@ -197,7 +224,7 @@ def _write(transfer: Transfer, results: Results, out: Path, stand_ins: StandIns 
     save_text(out / "results.json", json.dumps(described | results_json(results), indent=1, allow_nan=False) + "\n")
     intro = (
         f"{base.robot.name}, {len(base.actions)} trajectories a map; {trained} trained on {_samples(transfer)} "
-        f"of {kind} maps for {config.epochs} epochs, {len(config.seeds)} seeds; {machine()}.\n\n{MEANING}"
+        f"of {kind} maps for {config.epochs} epochs, {results.seeds} seeds; {machine()}.\n\n{MEANING}"
     )
     if base.preset.weights == "none" and IMAGENET in transfer.arms:
         intro += f" Without ImageNet weights the arm {IMAGENET} begins with random ones as well."

@@ -5,6 +5,7 @@ and are scored after every epoch on held-out ground. With `head_epochs` the trun
 are computed once for all seeds; with `epochs` everything is trained, as in the paper.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -121,13 +122,16 @@ class Transfer:
         """Returns the folder of a run, in the form that `travjax train` writes."""
         return self.folder / "runs" / f"{_name(arm)}_{seed}"
 
-    def rows(self, arm: str, seed: int) -> list[dict]:
-        """Trains a run as far as it is not trained yet; returns a row for its first state and for each epoch."""
+    def rows(self, arm: str, seed: int, until: float = math.inf) -> list[dict]:
+        """Trains a run as far as it is not trained yet; returns a row for its first state and for each epoch.
+
+        until: `time.monotonic()` after which no step begins; a run that has not ended by then has no rows
+        """
         place, run = self.place_of(arm, seed), self.run_of(arm, seed)
         if has_checkpoints(place):
             self._require_same(place, run)
-        if not self._is_finished(place, run):
-            self._train(arm, seed, place)
+        if not self._is_finished(place, run) and not self._train(arm, seed, place, until):
+            return []
         path = place / "metrics.jsonl"
         rows = [row for row in read_rows(path) if "eval_sets" in row]
         found, last, sites = [row.get("epoch") for row in rows], self.config.epochs, list(self.held_out)
@@ -162,7 +166,7 @@ class Transfer:
         require(begun == given, f"{place}: data set", given, f"{begun}, the one that the run was trained on")
         return meta["position"]["epoch"] == self.config.epochs
 
-    def _train(self, arm: str, seed: int, place: Path) -> None:
+    def _train(self, arm: str, seed: int, place: Path, until: float) -> bool:
         run = self.run_of(arm, seed)
         features = self._kept_features(arm)
         trainer = Trainer(
@@ -177,7 +181,7 @@ class Transfer:
         if self.config.frozen and features is None:
             path = self._features_file(arm)
             save_npz(output_folder(path.parent) / path.name, dataset=self.dataset.fingerprint, **trainer.features)
-        trainer.train()
+        return trainer.train(until)
 
     def _first(self, arm: str, seed: int) -> Network:
         """Makes the network that a run begins with; random trunks differ by seed unless they stay frozen."""
@@ -226,13 +230,22 @@ def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
     return {site: of(site) for site in sites}
 
 
-def run_all(transfer: Transfer, on_run: Callable[[str, int], object]) -> dict[str, dict[int, list[dict]]]:
-    """Returns the rows of all runs by arm and seed, trained one after the other; on_run is called with each one as it
-    begins.
+def run_all(
+    transfer: Transfer, on_run: Callable[[str, int], object], until: float = math.inf
+) -> dict[str, dict[int, list[dict]]]:
+    """Returns the rows of all runs by arm and seed, trained one after the other, all arms of a seed before the next.
+
+    on_run: is called with each one as it begins
+    until:  as `Transfer.rows` takes it; the seeds that all arms have ended by then are returned
     """
     results: dict[str, dict[int, list[dict]]] = {arm: {} for arm in transfer.arms}
-    for arm in transfer.arms:
-        for seed in transfer.config.seeds:
+    for seed in transfer.config.seeds:
+        rows = {}
+        for arm in transfer.arms:
             on_run(arm, seed)
-            results[arm][seed] = transfer.rows(arm, seed)
+            rows[arm] = transfer.rows(arm, seed, until)
+            if not rows[arm]:
+                return results
+        for arm in transfer.arms:
+            results[arm][seed] = rows[arm]
     return results

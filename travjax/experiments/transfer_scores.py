@@ -118,6 +118,11 @@ class Results:
         return next(iter(next(iter(self.arms.values())).values())).epochs[0].held_out
 
     @property
+    def seeds(self) -> int:
+        """The number of seeds of each arm."""
+        return len(next(iter(self.arms.values())))
+
+    @property
     def sites(self) -> list[str]:
         """The held-out sites, and ALL if there are several."""
         return list(self._some)

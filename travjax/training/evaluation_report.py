@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from travjax import progress
 from travjax.config import InputError, one_line
 from travjax.data import dataset
+from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples
 from travjax.devices import Devices
 from travjax.evaluation import map_figures, score_figures, tables
@@ -27,7 +28,7 @@ MARGINS = "regressed margins above their limits"
 @usual_flags()
 def evaluate_run(
     folder: str | Path,
-    data: str | Path | None = None,
+    data: str | Path | Dataset | None = None,
     checkpoint: str = "best",
     out: str | Path | None = None,
     *,
@@ -39,7 +40,7 @@ def evaluate_run(
 ) -> Evaluation:
     """Evaluates a training run, prints the tables and writes them with the figures; returns the network's scores.
 
-    data:       folder of a data set, instead of the run's own
+    data:       a data set, or the folder of one, instead of the run's own
     checkpoint: "best", "latest" or "heads"
     out:        folder to write to, instead of one in the run's folder
     maps, each: number of random test maps and of random trajectories of each, 0 for all, instead of the preset's
@@ -49,7 +50,8 @@ def evaluate_run(
     """
     place = user_path(folder)
     trained, estimator, meta = load_estimator(place, checkpoint)
-    evaluator = Evaluator.from_run(trained, dataset.load(data or place / DATA), Devices.all())
+    given = data if isinstance(data, Dataset) else dataset.load(data or place / DATA)
+    evaluator = Evaluator.from_run(trained, given, Devices.all())
     name = "evaluation" if checkpoint == "best" else f"evaluation_{checkpoint}"
     written = output_folder(out or place / name)
     sampled = trained.preset.evaluation

@@ -1,5 +1,6 @@
 """Fits an estimator: from a preset to a trained run in a folder; an interrupted run can be resumed."""
 
+import math
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -61,26 +62,37 @@ def fit(
     run: Run,
     folder: str | Path,
     devices: Devices | None = None,
-    data: str | Path | None = None,
+    data: str | Path | Dataset | None = None,
     resume: bool = False,
     option: str = "--out",
-) -> None:
+    until: float = math.inf,
+) -> bool:
     """Trains a run in a folder, and prints what it writes there.
 
     devices: devices to train on, all unless given
-    data:    folder of its data set, instead of one made by the preset
+    data:    its data set, or the folder of it, instead of one made by the preset
     resume:  whether to resume the run that the folder holds, if it holds one
     option:  what a message calls a folder that holds another run
+    until:   `time.monotonic()` after which no step begins; what is done by then is in a checkpoint to resume from
+    Returns whether all epochs are trained.
     Raises InputError before training starts when another process works in the folder, when it holds a run that differs
     or is not to be resumed, and when first weights or data set are missing, damaged or do not fit.
     """
     devices, place = devices or Devices.all(), user_path(folder)
     with held(place) if devices.main else nullcontext():
-        _fit(run, place, devices, data, resume, option)
+        return _fit(run, place, devices, data, resume, option, until)
 
 
-def _fit(wanted: Run, folder: Path, devices: Devices, data: str | Path | None, resume: bool, option: str) -> None:
-    """Trains a run in a folder that no other process uses."""
+def _fit(
+    wanted: Run,
+    folder: Path,
+    devices: Devices,
+    data: str | Path | Dataset | None,
+    resume: bool,
+    option: str,
+    until: float,
+) -> bool:
+    """Trains a run in a folder that no other process uses; returns whether all epochs are trained."""
     preset = wanted.preset
     resumes = has_checkpoints(folder)
     if resumes:
@@ -100,9 +112,10 @@ def _fit(wanted: Run, folder: Path, devices: Devices, data: str | Path | None, r
         trainer.start(estimator)
         if devices.main and wanted.kind.sees_images:
             progress.wrote(_draw_inputs(trainer, folder))
-    trainer.train()
+    finished = trainer.train(until)
     if devices.main:
         _finish(folder, wanted)
+    return finished
 
 
 def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
@@ -112,10 +125,10 @@ def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
     Run.load(folder).require_same_settings(wanted, f"{option} {folder}")
 
 
-def _dataset(data: str | Path | None, wanted: Run, folder: Path, devices: Devices) -> Dataset:
+def _dataset(data: str | Path | Dataset | None, wanted: Run, folder: Path, devices: Devices) -> Dataset:
     """Returns the given data set, else the run's own, which is made if it does not exist yet."""
     if data:
-        return dataset.load(data)
+        return data if isinstance(data, Dataset) else dataset.load(data)
     kept, config = folder / DATA, wanted.preset.dataset
     put_back(kept)
     for split, size in zip(dataset.SPLITS[:2], config.split_sizes()[:2], strict=True):

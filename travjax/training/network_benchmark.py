@@ -5,8 +5,6 @@ channels-last; it is measured where PyTorch is installed.
 """
 
 import resource
-import statistics
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -88,24 +86,24 @@ class Bench:
 
         return self._timed("inputs of a batch, a fresh subset of 64 maps included", BATCH, batch)
 
-    def training_step(self) -> dict:
-        """Measures a training step of the whole network, from sample indices to new parameters."""
+    def training_step(self, size: int = STEP_BATCH) -> dict:
+        """Measures a training step of the whole network on `size` samples, from sample indices to new parameters."""
         phase, optimizer = TrajectoryEstimator.phases[2], TrainingConfig().make_optimizer(2, 1)
         settings = StepSettings(self.graph, phase, optimizer, penalty=0.001)
         trained = {name: self.variables[name] for name in phase.trained}
         state = jax.tree.map(jax.numpy.copy, self.variables) | {"optimizer": optimizer.init(trained)}
         state = self.devices.replicate(state)
-        maps, trajectories = (index[:STEP_BATCH] for index in self.sampler.epoch(0))
+        maps, trajectories = (np.resize(index, size) for index in self.sampler.epoch(0))
         failed = self.dataset.failed((maps, trajectories)).astype(np.float32)
         inputs = phase.place(self.source, (maps, trajectories), self.devices)
-        batch = Batch(inputs, *self.devices.shard((failed, np.ones(STEP_BATCH, np.float32))))
+        batch = Batch(inputs, *self.devices.shard((failed, np.ones(size, np.float32))))
 
         def step():
             nonlocal state
             state, loss = update(state, batch, 0, 0, settings=settings)
             return loss
 
-        return self._timed(FLAX, STEP_BATCH, step)
+        return self._timed(FLAX, size, step)
 
     def torch_step(self) -> dict:
         """Measures the same step in PyTorch on ready images: network, loss, gradients, RMSprop."""
@@ -121,12 +119,7 @@ class Bench:
         return self._timed(f"all {count} trajectories of a map through the network", count, run, repeats)
 
     def _timed(self, what: str, batch: int, run: Callable[[], object], repeats: int | None = None) -> dict:
-        seconds = []
-        for _ in range((repeats or self.repeats) + 1):
-            start = time.perf_counter()
-            jax.block_until_ready(run())
-            seconds.append(time.perf_counter() - start)
-        median = statistics.median(seconds[1:])
+        median, first = simulator_benchmark.median_time(run, repeats or self.repeats)
         return {
             "what": what,
             "batch": batch,
@@ -134,8 +127,8 @@ class Bench:
             "ms_per_sample": median / batch * 1e3,
             "samples_per_s": batch / median,
             "ratio": None,
-            "first_call_s": seconds[0],
-            "repeats": len(seconds) - 1,
+            "first_call_s": first,
+            "repeats": repeats or self.repeats,
             "peak_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
 

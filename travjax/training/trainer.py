@@ -139,29 +139,35 @@ class Trainer:
         self._say(f"goes on from step {here.total}: phase {here.phase}, epoch {here.epoch + 1}, batch {here.step + 1}")
 
     @usual_flags()
-    def train(self) -> None:
+    def train(self, until: float = math.inf) -> bool:
         """Trains from the present position to the end, with a checkpoint at regular steps and after each epoch.
 
+        until: `time.monotonic()` after which no step begins: the last one is saved in a checkpoint; in one process only
+        Returns whether training has reached its end.
         Raises InputError when another process works in the folder, and when the loss becomes NaN or infinite; the last
         checkpoint is kept.
         """
         with held(self.folder) if self.devices.main else nullcontext():
-            self._train()
+            self._train(until)
+        return self.finished
 
-    def _train(self) -> None:
+    @property
+    def finished(self) -> bool:
+        """Whether all epochs are trained."""
+        return self.position.phase == 2 and self.position.epoch == self.config.epochs
+
+    def _train(self, until: float) -> None:
         if self.devices.main:
             self.log = RunLog(self.folder, self.position.total)
         try:
             if not self.position.total and (row := self._eval_scores()) and self.log:
                 self.log.write({"step": 0, "phase": self.position.phase, "epoch": 0} | row)
-            while self.position.phase == 1:
-                if self.position.epoch == self.config.head_epochs:
+            while not self.finished and time.monotonic() < until:
+                if self.position.phase == 1 and self.position.epoch == self.config.head_epochs:
                     self.checkpoints.save_named("heads", self._variables, self._meta(optimizer=0))
                     self._begin(2)
                 else:
-                    self._train_epoch()
-            while self.position.epoch < self.config.epochs:
-                self._train_epoch()
+                    self._train_epoch(until)
         finally:
             if self.log:
                 self.log.close()
@@ -190,8 +196,10 @@ class Trainer:
             self._optimizers[phase] = self.config.make_optimizer(phase, self._planned_steps(phase))
         return self._optimizers[phase]
 
-    def _train_epoch(self) -> None:
-        """Trains from the present step to the end of the epoch, then validates and saves a checkpoint."""
+    def _train_epoch(self, until: float) -> None:
+        """Trains from the present step to the end of the epoch, then validates and saves a checkpoint; when it is
+        later than `until`, it saves one and ends.
+        """
         here, data = self.position, self.data
         steps, count, done = data.steps(here.phase, here.epoch), data.count(here.phase, here.epoch), here.samples
         began = time.perf_counter()
@@ -200,7 +208,8 @@ class Trainer:
             for batch in self._batches():
                 running.append((self._step(batch), float(batch.weight.sum())))
                 here.step, here.total = here.step + 1, here.total + 1
-                saves = here.step % self.config.checkpoint_steps == 0 and here.step < steps
+                stops = time.monotonic() >= until and here.step < steps
+                saves = stops or here.step % self.config.checkpoint_steps == 0 and here.step < steps
                 while len(running) > (0 if saves or here.step == steps else IN_FLIGHT):
                     self._count(*running.popleft(), here.step - len(running), bar)
                 if not running and not is_finite(self.state):
@@ -210,6 +219,8 @@ class Trainer:
                     self._report({"loss": here.loss / here.samples, "samples_per_s": rate})
                 if saves:
                     self.checkpoints.save(here.total, self.state, self._meta(here.phase))
+                if stops:
+                    return
         self._finish_epoch((here.samples - done) / (time.perf_counter() - began))
 
     def _batches(self) -> Iterator[Batch]:

@@ -1,0 +1,161 @@
+"""The parts of the command: each goes on where it stopped, ends in time, and puts what is small into the folder."""
+
+import importlib.util
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from travjax import progress
+from travjax.config import InputError, read_text
+from travjax.data.dataset import Dataset, DatasetConfig, generate
+from travjax.devices import Devices
+from travjax.estimators.names import FIELD, RESNET
+from travjax.evaluation.metrics import OVERALL, json_ready
+from travjax.evaluation.simulator_benchmark import write_tsv
+from travjax.experiments import transfer
+from travjax.experiments.gpu.config import BENCH, TRANSFER, Plan
+from travjax.experiments.gpu.kernels import COLUMNS, Kernels
+from travjax.files import atomic_write, output_folder
+from travjax.runs.checkpoint import load_meta
+from travjax.runs.model_card import export_run
+from travjax.runs.run import Run, has_checkpoints
+from travjax.runs.run_log import read_rows
+from travjax.training.evaluation_report import evaluate_run
+from travjax.training.fit import fit
+
+WORK = "work"
+"""Name of the folder of checkpoints and all that is large."""
+
+LARGEST_EXPORT = 20e6
+"""Bytes of the largest estimator that is exported."""
+
+Result = dict[str, Any]
+"""What is known of a part, as JSON can hold it; "finished" tells whether nothing is left to do."""
+
+
+@dataclass
+class Session:
+    """One call of the command.
+
+    out:  the folder of results
+    made: the data sets that were made, in memory, by their configuration, and how many seconds that took
+    """
+
+    plan: Plan
+    out: Path
+    made: dict[DatasetConfig, tuple[Dataset, float]] = field(default_factory=dict)
+
+    @property
+    def work(self) -> Path:
+        """The folder of checkpoints and all that is large."""
+        return self.out / WORK
+
+    def dataset(self, run: Run) -> tuple[Dataset, float]:
+        """Makes and labels the maps of a run, unless that is done; returns them and the seconds that it took."""
+        config = run.preset.dataset
+        if config not in self.made:
+            began = time.perf_counter()
+            with progress.bar("making", config.maps, "map") as bar:
+                made = generate(config, run.setup, bar.update)
+            self.made[config] = made, time.perf_counter() - began
+        return self.made[config]
+
+    def bench(self, before: Result, until: float) -> Result:
+        """Measures kernels and network; rows of earlier calls are kept."""
+        kernels, rows = Kernels(self.plan.config, self.plan.runs[RESNET]), []
+        for row in kernels.rows(before.get("rows", []), until):
+            rows.append(row)
+            with atomic_write(self.out / "bench.tsv") as temporary:
+                write_tsv(rows, temporary, COLUMNS)
+        return {"finished": len(rows) == len(kernels.measurements()), "rows": rows}
+
+    def train(self, name: str, before: Result, until: float) -> Result:
+        """Trains an estimator until its evaluation has to begin, and evaluates the best of its checkpoints."""
+        run, folder = self.plan.runs[name], self.work / name
+        data, seconds = self.dataset(run)
+        result = before | {"maps": len(data.split), "made_and_labelled_s": seconds}
+        stop = until - self.plan.config.evaluating * (until - time.monotonic())
+        finished = fit(run, folder, Devices.all(), data, resume=True, until=stop)
+        if not has_checkpoints(folder):
+            return result | {"finished": False}
+        which = _best(folder) or "latest"
+        maps = 0 if run.kind.reads_whole_maps else self.plan.config.test_maps
+        scores = evaluate_run(
+            folder, data, which, folder / "evaluation", maps=maps, each=0, figure_maps=2, baselines=False
+        )
+        at = load_meta(folder / "checkpoints")["position"]
+        rates = [row["samples_per_s"] for row in read_rows(folder / "metrics.jsonl") if "samples_per_s" in row]
+        result |= {
+            "finished": finished,
+            "phase": at["phase"],
+            "epochs": at["epoch"],
+            "steps": at["total"],
+            "samples_per_s": rates[-1] if rates else None,
+            "evaluated": which,
+            "f1": json_ready(scores.f1)[OVERALL],
+            "recall": json_ready(scores.scores[OVERALL].confusion.recall),
+        }
+        _copy(folder / "evaluation", self.out / name, ("tables.txt", "evaluation.json", "precision_recall.png"))
+        _copy(folder, self.out / name, ("metrics.jsonl", "run.json"))
+        return result | self._export(name, run, which)
+
+    def _export(self, name: str, run: Run, which: str) -> Result:
+        """Exports an estimator with its model card, unless it is too large."""
+        size = sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(run.template(0)))
+        if size > LARGEST_EXPORT:
+            return {"exported": None}
+        path, _ = export_run(self.work / name, self.out / f"{name}.safetensors", which)
+        return {"exported": path.name}
+
+    def transfer(self, before: Result, until: float) -> Result:
+        """Trains on real maps, or on stand-ins where none can be read, from the ResNet50 as far as it is trained."""
+        synthetic, folder = self.work / RESNET, output_folder(self.work / TRANSFER)
+        if not _best(synthetic):
+            raise InputError(f"{synthetic}: no epoch is finished yet; needed: more --time for {RESNET}")
+        stop = until - self.plan.config.evaluating * (until - time.monotonic())
+        finished = transfer.experiment(
+            self.plan.file(self.plan.config.transfer),
+            folder,
+            lambda preset: Run.load(synthetic),
+            synthetic,
+            stand_ins=importlib.util.find_spec("rasterio") is None,
+            until=stop,
+        )
+        _copy(folder, self.out / TRANSFER, ("report.md", "results.json", "f1.png", "stand_in_sites.png", "maps.png"))
+        return {
+            "finished": finished,
+            "synthetic_steps": load_meta(synthetic / "checkpoints", "best")["position"]["total"],
+        }
+
+    def part(self, name: str) -> Callable[[Result, float], Result]:
+        """Returns the function of a part; it takes what is known of it, and `time.monotonic()` when it has to end."""
+        named = {BENCH: self.bench, TRANSFER: self.transfer}
+        return named.get(name) or (lambda before, until: self.train(name, before, until))
+
+
+def _best(folder: Path) -> str | None:
+    """Returns "best" where a run has finished an epoch, else None."""
+    try:
+        load_meta(folder / "checkpoints", "best")
+    except InputError:
+        return None
+    return "best"
+
+
+def _copy(source: Path, target: Path, names: tuple[str, ...]) -> None:
+    """Copies those of the named files that exist."""
+    output_folder(target)
+    for name in names:
+        if (source / name).exists():
+            shutil.copy(source / name, target / name)
+
+
+def tables(out: Path, name: str) -> str | None:
+    """Returns the tables of an estimator's evaluation, or of the transfer experiment, if there are any."""
+    path = out / name / ("report.md" if name == TRANSFER else "tables.txt")
+    return read_text(path).strip() if name in (FIELD, RESNET, TRANSFER) and path.exists() else None
