@@ -86,7 +86,7 @@ class Session:
         which = _best(folder) or "latest"
         maps = 0 if run.kind.reads_whole_maps else self.plan.config.test_maps
         scores = evaluate_run(
-            folder, data, which, folder / "evaluation", maps=maps, each=0, figure_maps=2, baselines=False
+            folder, data, which, folder / "evaluation", maps=maps, each=0, figure_maps=0, baselines=False
         )
         at = load_meta(folder / "checkpoints")["position"]
         rates = [row["samples_per_s"] for row in read_rows(folder / "metrics.jsonl") if "samples_per_s" in row]
