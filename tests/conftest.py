@@ -46,9 +46,9 @@ gc.set_threshold(20_000, 20, 20)
 
 LONGEST = [
     *("commands/test_train.py", "traversal/test_tyre.py", "traversal/test_traverse.py", "test_cli.py"),
-    *("test_jax_flags.py", "test_docs.py", "experiments/test_transfer.py", "runs/test_predictor.py"),
-    *("resnet/test_convolution.py", "resnet/test_imagenet_weights.py", "training/test_trainer.py"),
-    *("site/test_kernel.py", "site/test_mapping.py", "simulation/test_events.py", "commands/test_evaluate.py"),
+    *("experiments/test_gpu.py", "test_jax_flags.py", "test_docs.py", "experiments/test_transfer.py"),
+    *("runs/test_predictor.py", "resnet/test_convolution.py", "resnet/test_imagenet_weights.py"),
+    *("training/test_trainer.py", "site/test_kernel.py", "site/test_mapping.py", "simulation/test_events.py", "commands/test_evaluate.py"),
     *("resnet/test_network.py", "physics/test_physics.py", "terrain/test_styles.py", "commands/test_predict.py"),
     *("estimators/test_map_estimator.py", "runs/test_checkpoint.py", "test_wheel.py", "planning/test_oracle.py"),
     *("models/test_input_images.py", "evaluation/test_map_figures.py", "test_examples.py"),
