@@ -32,6 +32,7 @@ import json, sys, time
 for name in ("rasterio", "opensimplex", "tensorflow_datasets", "torch", "h5py", "keras", "mujoco", "xarray"):
     sys.modules[name] = None
 from types import SimpleNamespace
+from travjax.evaluation import map_figures
 from travjax.experiments.gpu import __main__ as gpu
 from travjax.training import trainer
 
@@ -40,6 +41,12 @@ def command(*words):
     assert code == 0, code
     return json.load(open("out/summary.json"))
 
+
+def save(figure, path):  # drawing would take a fifth of the time
+    path.touch()
+    return path
+
+map_figures.save = save
 ticks = iter([0.0] * 4)
 trainer.time = SimpleNamespace(monotonic=lambda: next(ticks, float("inf")), perf_counter=time.perf_counter)
 first = command("--parts", "field")
