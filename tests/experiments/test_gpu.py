@@ -14,6 +14,9 @@ import pytest
 
 from tests.conftest import SETUPS
 from tests.small_training import loads, run_of
+from travjax.config import load_toml
+from travjax.data.provenance import SitesConfig
+from travjax.estimators.preset import Preset
 from travjax.experiments.gpu import __main__ as gpu
 from travjax.experiments.gpu import kernels
 from travjax.experiments.gpu.config import PARTS, GpuConfig, Plan
@@ -21,6 +24,7 @@ from travjax.experiments.gpu.estimate import estimate
 from travjax.experiments.gpu.kernels import Kernels, Measured, labelling_work
 from travjax.experiments.gpu.limits import DEVICES, Work
 from travjax.experiments.gpu.programs import read_program, training_step
+from travjax.experiments.transfer_runs import TransferConfig
 from travjax.files import find_preset
 from travjax.runs.model_file import read_model
 from travjax.simulation.contact import Contact
@@ -120,6 +124,21 @@ def test_the_report_says_how_far_each_part_is_and_what_was_measured(rehearsed):
     assert (out / "resnet50/tables.txt").read_text().strip() in report
 
 
+def test_what_the_device_refuses_is_said_and_left_out(monkeypatch, capsys):
+    def refused():
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory.\nlong table")
+
+    plan = Plan.load(find_preset("smoke", "gpu"), "none")
+    done = lambda: Measured(0.5, 1.0, Work(1, {"float32": 1}))
+    listed = [("large maps", 9, refused), ("small maps", 1, done), ("maps", 4, done), ("kept maps", 2, refused)]
+    monkeypatch.setattr(Kernels, "measurements", lambda kernels: listed)
+    kept = {"what": "kept maps", "at_once": 2}
+    rows = list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], float("inf")))
+    assert [row["what"] for row in rows] == ["small maps", "maps", "kept maps"] and rows[-1] == kept
+    assert capsys.readouterr().out.startswith("large maps, 9 at once: left out: RESOURCE_EXHAUSTED")
+    assert list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], -1.0)) == [kept]
+
+
 # ---- What work takes at least
 
 
@@ -189,12 +208,18 @@ def test_the_estimate_names_the_device_and_says_that_nothing_was_measured():
 # ---- Presets and bad input
 
 
-@pytest.mark.parametrize("name", ["paper", "smoke"])
+WEIGHTS = {"paper": "imagenet/resnet50_imagenet.npz", "smoke": "none"}
+
+
+@pytest.mark.parametrize("name", WEIGHTS)
 def test_presets_and_what_they_name_can_be_read(name):
     plan = Plan.load(find_preset(name, "gpu"), "none")
     assert [run.preset.model for run in plan.runs.values()] == ["field", "resnet50"]
     assert plan.runs["field"].setup == plan.runs["resnet50"].setup
-    assert plan.file(plan.config.transfer).is_file()
+    path = plan.file(plan.config.transfer)
+    transfer = load_toml(path, TransferConfig)
+    assert SitesConfig.load(path.parent / transfer.sites) == SitesConfig.load(find_preset("real", "sites"))
+    assert Preset.load(path.parent / transfer.synthetic) == replace(plan.runs["resnet50"].preset, weights=WEIGHTS[name])
     assert Kernels(plan.config, plan.runs["resnet50"]).measurements()
 
 

@@ -13,10 +13,13 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import zip_longest
 
 import jax
 import numpy as np
 
+from travjax import progress
+from travjax.config import one_line
 from travjax.evaluation.simulator_benchmark import median_time, mixed_maps, terrain_row
 from travjax.experiments.gpu.config import GpuConfig
 from travjax.experiments.gpu.limits import DEVICES, Work
@@ -100,16 +103,22 @@ class Kernels:
         """Yields the rows in order of worth: those that are kept, and others while it is not later than `until`.
 
         until: of `time.monotonic()`
+        What the device refuses, for want of memory for one, is said and left out.
         """
         there = {(row["what"], row["at_once"]): row for row in kept}
         for what, at_once, measure in self.measurements():
             if row := there.get((what, at_once)):
                 yield row
             elif time.monotonic() < until:
-                yield measure().row(what, at_once, self.config.repeats)
+                try:
+                    measured = measure()
+                except jax.errors.JaxRuntimeError as error:
+                    progress.say(f"{what}, {at_once} at once: left out: {one_line(error)}")
+                else:
+                    yield measured.row(what, at_once, self.config.repeats)
 
     def measurements(self) -> list[tuple[str, int, Callable[[], Measured]]]:
-        """Lists what is measured: a text, how many at once, and a function that does it."""
+        """Lists what is measured: a text, how many at once, and a function; one size of each comes first."""
         maps, batches = self.config.maps, self.config.batches
         numbers, count = self.run.preset.trunk.dtype, len(self.run.actions)
         steps = [(f"ResNet50 training, {numbers}, images", size, partial(self._step, size)) for size in batches]
@@ -117,17 +126,17 @@ class Kernels:
             (f"ResNet50, trajectories of a map, {size} at a time", count, partial(self._predictions, size))
             for size in batches
         ]
-        labelling = [
-            (f"labelling by {contact}, maps", size, partial(self._labelling, contact, size))
+        nearest, tyre = (
+            [(f"labelling by {contact}, maps", size, partial(self._labelling, contact, size)) for size in maps]
             for contact in CONTACTS
-            for size in maps
-        ]
+        )
         terrain = [("terrain, maps", size, partial(self._terrain, size)) for size in maps]
-        site = [
-            (f"site by {contact}, places", self._tile(contact)[1].edge ** 2, partial(self._site, contact))
+        site, site_by_tyre = (
+            [(f"site by {contact}, places", self._tile(contact)[1].edge ** 2, partial(self._site, contact))]
             for contact in CONTACTS
-        ]
-        return [*labelling, *steps, *whole, *terrain, *site]
+        )
+        ranks = zip_longest(nearest, steps, whole, terrain, site, tyre, site_by_tyre)
+        return [one for rank in ranks for one in rank if one]
 
     @cached_property
     def _bench(self) -> Bench:
