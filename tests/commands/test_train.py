@@ -55,14 +55,6 @@ sys.exit(cli.main(sys.argv[2:]))
 KILLED = STOPPED.format(stop="os.kill(os.getpid(), signal.SIGKILL)")
 HELD = STOPPED.format(stop="time.sleep(600)")
 
-TWO_COMMANDS = """
-import sys
-from travjax import cli
-then = sys.argv.index("then")
-assert cli.main(sys.argv[1:then]) == 2
-sys.exit(cli.main(sys.argv[then + 1 :]))
-"""
-
 
 @pytest.fixture(scope="module")
 def words(tmp_path_factory, few) -> tuple:
@@ -244,22 +236,12 @@ def require_close(folder, other):
             assert a[name] == pytest.approx(b[name], rel=1e-4), (name, a["step"])
 
 
-def test_four_devices_train_like_one_and_refuse_a_batch_that_they_cannot_share(alone, tmp_path):
-    words, six = alone[0], tmp_path / "six.toml"
-    six.write_text(FEW_STEPS.replace("batch_size = 8", "batch_size = 6"))
-    refused = (words[0], six, *words[2:], "--out", tmp_path / "refused")
-    both = (*refused, "then", *words, "--out", tmp_path / "run")
-    ((_, err),) = finished(program(both, script=TWO_COMMANDS, devices=4))
-    assert "travjax: batch_size = 6: must be a multiple of the 4 devices that share a batch" in err.splitlines()
-    require_close(tmp_path / "run", alone[1])
-
-
-def test_two_processes_train_like_one_device_and_go_on_together(alone, tmp_path):
+def test_two_processes_of_two_devices_train_like_one_device_and_go_on_together(alone, tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
     words = (*alone[0], "--out", tmp_path / "run", "--coordinator", address, "--processes", 2, "--process")
-    (out, _), (quiet, _) = finished(*(program((*words, process)) for process in (0, 1)))
+    (out, _), (quiet, _) = finished(*(program((*words, process), devices=2) for process in (0, 1)))
     require_close(tmp_path / "run", alone[1])
     assert "phase 2, epoch 1: loss" in out
     assert [line for line in quiet.splitlines() if not line.startswith("[Gloo]")] == []
