@@ -74,7 +74,7 @@ own-python:
 	$(BIN)/python -m pip install --quiet --no-deps --no-index --no-build-isolation --editable .
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 check: setup
 	$(BIN)/ruff check .

@@ -90,8 +90,17 @@ def pytest_unconfigure(config):
         shutil.rmtree(os.environ["JAX_COMPILATION_CACHE_DIR"], ignore_errors=True)
 
 
+def group_files(items) -> None:
+    """Marks tests with the group that a worker takes as a whole: their file, or all files that use `trained`."""
+    training = {item.path for item in items if "trained" in item.fixturenames}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("trained" if item.path in training else str(item.path)))
+
+
+@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in its own hook
 def pytest_collection_modifyitems(items):
     items.sort(key=place_of)
+    group_files(items)
     if jax.default_backend() != "gpu":
         skip = pytest.mark.skip(reason=f"needs a GPU, and JAX runs on {jax.default_backend()} here")
         for item in items:
