@@ -32,9 +32,10 @@ DESCRIPTION = (
 MEANING = (
     "A task leads from a place to another, between which the exact planner finds a path on the true map. A path "
     "*arrives* if no pose of it exceeds a limit of the robot on the true map; *length* is that of paths that arrived "
-    "over that of the best path. Intervals are Wilson's. Missing nodes have the height of the nearest known one, for "
-    "every method. The best filter is the one of none, a 3 x 3 median and Gaussians that gives the simulator the "
-    "largest F1 on other maps with the same corruption."
+    "over that of the best path, which is the cheapest one, its risk included, and not always the shortest. Intervals "
+    "are Wilson's. Missing nodes have the height of the nearest known one, for every method. The best filter is that "
+    "of none, a 3 x 3 median and Gaussians that gives the simulator the largest F1 on other maps with the same "
+    "corruption."
 )
 
 DONE = "trials.json"

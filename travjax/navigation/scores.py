@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from travjax.evaluation.tables import rows_table
 from travjax.navigation.methods import METHODS
-from travjax.navigation.trials import ARRIVED, FAILED, REFUSED, Trial
+from travjax.navigation.trials import ARRIVED, ENDS, FAILED, REFUSED, Trial
 
 CONFIDENCE = 0.95
 
@@ -42,7 +42,7 @@ def table(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str
             mine = _alike(trials, kind, corruption, method)
             if not mine:
                 continue
-            counts = {end: sum(one.ended == end for one in mine) for end in (ARRIVED, FAILED, REFUSED)}
+            counts = {end: sum(one.ended == end for one in mine) for end in ENDS}
             low, high = interval(counts[ARRIVED], len(mine))
             detours = [one.detour for one in mine if one.ended == ARRIVED]
             rows.append(
@@ -61,20 +61,31 @@ def table(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str
 
 
 def winners(trials: Sequence[Trial], kind: str, corruptions: Sequence[str]) -> str:
-    """Says for each corruption which methods arrived most often, and which are not told apart from them."""
+    """Says for each corruption which methods arrived most often, and which are not told apart from them; and which
+    failed least often.
+    """
     lines = []
     for corruption in corruptions:
-        shares = {}
-        for method in METHODS:
-            mine = _alike(trials, kind, corruption, method)
-            if mine:
-                shares[method] = (sum(one.ended == ARRIVED for one in mine), len(mine))
-        best = max(shares, key=lambda method: shares[method][0] / shares[method][1])
-        least = interval(*shares[best])[0]
-        close = [name for name in shares if name != best and interval(*shares[name])[1] >= least]
-        beside = f"; its interval overlaps with those of {', '.join(close)}" if close else ""
-        lines.append(f"- {corruption}: {best}, {shares[best][0] / shares[best][1]:.1%}{beside}")
+        of_method = {method: _alike(trials, kind, corruption, method) for method in METHODS}
+        tried = {method: [one.ended for one in mine] for method, mine in of_method.items() if mine}
+        arrived, failed = (
+            {name: ends.count(end) / len(ends) for name, ends in tried.items()} for end in (ARRIVED, FAILED)
+        )
+        within = {method: interval(ends.count(ARRIVED), len(ends)) for method, ends in tried.items()}
+        best, fewest = max(arrived, key=arrived.__getitem__), min(failed.values())
+        close = [method for method in tried if method != best and within[method][1] >= within[best][0]]
+        beside = f"; its interval overlaps with those of {_listed(close)}" if close else ""
+        safest = _listed([method for method in tried if failed[method] == fewest])
+        lines.append(
+            f"- {corruption}: *{best}* arrived most often, {arrived[best]:.1%}{beside}. "
+            f"Fewest tasks failed on the way, {fewest:.1%}, with {safest}."
+        )
     return "\n".join(lines)
+
+
+def _listed(methods: Sequence[str]) -> str:
+    """Lists names of methods, which may hold commas, in italics."""
+    return ", ".join(f"*{method}*" for method in methods)
 
 
 def figure(trials: Sequence[Trial], corruptions: Sequence[str]) -> Figure:
@@ -91,7 +102,7 @@ def figure(trials: Sequence[Trial], corruptions: Sequence[str]) -> Figure:
             ax.set_ylabel(f"share that {title}" if column == 0 else "")
             ax.set_xticks(range(len(corruptions)), corruptions, rotation=30, ha="right", fontsize=8)
             ax.grid(alpha=0.3)
-    axes[0, 0].set_ylim(0, 1.02)
+    axes[0, 0].set_ylim(-0.03, 1.03)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside right upper", fontsize=8, title="95 % intervals")
     return drawn
@@ -110,4 +121,4 @@ def _draw(ax, trials: Sequence[Trial], kind: str, corruptions: Sequence[str], en
                 low.append(share - least)
                 high.append(most - share)
         bars = np.maximum([low, high], 0)
-        ax.errorbar(x, y, bars, color=colour, marker=marker, markersize=5, linewidth=1, capsize=2, label=method)
+        ax.errorbar(x, y, bars, color=colour, fmt=marker, markersize=5, linewidth=1, capsize=2, label=method)
