@@ -14,7 +14,7 @@ YARD := $(TRAVJAX_DATA)/terrain/mars_yard.tif
 export TRAVJAX_DATA
 
 .DEFAULT_GOAL := help
-.PHONY: help setup label train gpu own-python test check bench docs clean
+.PHONY: help setup label train gpu own-python test test-all check bench docs clean
 
 help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
@@ -26,7 +26,7 @@ help:
 	@echo "make gpu     on an NVIDIA GPU, measure, train and evaluate as much as fits into TIME seconds ($(TIME)), into"
 	@echo "             $(OUT)/gpu; again goes on; PRESET=smoke|paper (paper), WEIGHTS as above; EXTRAS=cuda installs JAX"
 	@echo "             for it, BIN=DIR takes the programs of a Python that has everything and needs no network"
-	@echo "make test    run the tests"
+	@echo "make test    run the tests; make test-all: the slow ones too"
 	@echo "make check   lint, types and layering"
 	@echo "make bench   measure speed, into $(OUT)/bench"
 	@echo "make docs    build the documentation, into docs/_build/html"
@@ -74,6 +74,9 @@ own-python:
 	$(BIN)/python -m pip install --quiet --no-deps --no-index --no-build-isolation --editable .
 
 test: setup
+	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder -m "not slow"
+
+test-all: setup
 	$(BIN)/python -m pytest -n 2 --dist loadgroup --no-loadscope-reorder
 
 check: setup

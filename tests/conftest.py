@@ -57,9 +57,62 @@ LONGEST = [
 """Files of 20 s or more. They go first, so that workers that take a file at a time end at about the same time."""
 
 
+SLOW = {
+    "commands/test_train.py": ("test_two_processes_of_two_devices",),
+    "experiments/test_gpu.py": tuple(
+        f"test_{name}"
+        for name in (
+            "a_part_that_runs_out_of_time",
+            "all_parts_are_finished",
+            "everything_small_lies_in_the_folder",
+            "the_report_says_how_far",
+        )
+    ),
+    "resnet/test_convolution.py": ("test_four_devices_find", "test_the_gradient_of_a_resnet_is"),
+    "resnet/test_imagenet_weights.py": (
+        "test_every_stage_of_a_converted_network_is_that_of_torch",
+        "test_another_epsilon_of_the_network_leaves_its_function",
+    ),
+    "resnet/test_network.py": ("test_every_stage_agrees_with_float64",),
+    "runs/test_checkpoint.py": ("test_a_kill_at_any_moment_loses_no_checkpoint",),
+    "runs/test_model_file.py": ("test_no_bit_that_turned_over_gives_another_estimator",),
+    "simulation/test_events.py": ("test_training_scores_the_four_events",),
+    "site/test_kernel.py": (
+        "test_at_the_middle_of_a_map_a_primitive_is_a_trajectory[tyre]",
+        "test_bits_do_not_depend_on_the_tiles[tyre]",
+        "[mars_live_site",
+    ),
+    "site/test_mapping.py": ("test_a_cluster_makes_the_same_map",),
+    "terrain/test_styles.py": ("test_the_maps_are_the_same_where_float64_is_enabled",),
+    "test_cli.py": (
+        "test_the_program_labels_and_a_second_start_compiles_nothing_anew",
+        "test_a_world_makes_the_same_ground_on_a_larger_map_and_is_recorded[label]",
+        "test_a_world_makes_the_same_ground_on_a_larger_map_and_is_recorded[dataset]",
+    ),
+    "test_docs.py": tuple(
+        f"test_python_of_a_page_runs_and_prints_what_it_says[docs/{page}.md]"
+        for page in ("training", "plans", "site-maps")
+    ),
+    "test_fuzz.py": ("test_a_damaged_file_gives", "test_the_short_campaign_gets"),
+    "test_jax_flags.py": ("test_a_run_is_the_same_and_goes_on", "test_a_fresh_process_under_all_flags"),
+    "training/test_trainer.py": ("test_a_narrow_trunk_learns_32_samples_by_heart",),
+    "traversal/test_traverse.py": ("[unpaired radii-7]", "[fine large map-7]", "[coarse small map-7]"),
+    "traversal/test_tyre.py": ("[Husky, odd turns]", "[without turns, fine]"),
+}
+"""Parts of names of tests that take long and check on other input, or as a whole, what quicker tests check too.
+
+`make test` leaves them out, `make test-all` does not.
+"""
+
+
+def file_of(item) -> str:
+    """The file of a test, from this folder on."""
+    return item.path.relative_to(Path(__file__).parent).as_posix()
+
+
 def place_of(item) -> int:
     """Where the file of a test stands among LONGEST, or behind them."""
-    file = item.path.relative_to(Path(__file__).parent).as_posix()
+    file = file_of(item)
     return LONGEST.index(file) if file in LONGEST else len(LONGEST)
 
 
@@ -101,6 +154,9 @@ def group_files(items) -> None:
 def pytest_collection_modifyitems(items):
     items.sort(key=place_of)
     group_files(items)
+    for item in items:
+        if any(part in item.name for part in SLOW.get(file_of(item), ())):
+            item.add_marker(pytest.mark.slow)
     if jax.default_backend() != "gpu":
         skip = pytest.mark.skip(reason=f"needs a GPU, and JAX runs on {jax.default_backend()} here")
         for item in items:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 import travjax
+from tests.conftest import LONGEST, SLOW
 
 LAYERS = {
     "": "config signals locks memory files npz_stream progress jax_flags batching devices",
@@ -162,6 +163,15 @@ def test_misuse_of_argparse_is_found(source, expected):
 @pytest.mark.parametrize("module", MODULES)
 def test_no_module_builds_namespaces_or_reads_what_is_private_to_argparse(module):
     assert misused((PACKAGE / f"{module.replace('.', '/')}.py").read_text()) == []
+
+
+@pytest.mark.parametrize("file", sorted({*LONGEST, *SLOW}))
+def test_what_is_said_of_tests_is_of_tests_that_are_there(file):
+    text = (Path(__file__).parent / file).read_text()
+    for part in SLOW.get(file, ()):
+        assert (
+            f"def {part.split('[')[0]}" in text if part.startswith("test_") else part.strip("[]").split("-")[0] in text
+        )
 
 
 def test_no_public_name_is_that_of_a_module_which_would_hide_it():

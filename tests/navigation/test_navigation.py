@@ -102,6 +102,7 @@ def test_every_trial_counts_once_in_table_figure_and_verdict():
         (dict(tasks=0), "tasks = 0: must be a whole number of at least 1"),
         (dict(threshold=1.5), "threshold = 1.5: must be above 0 and at most 1"),
         (dict(style="sea"), "style = 'sea': must be one of"),
+        (dict(real=(RealGround("a/site.tif"), RealGround("b/site.npz"))), "real = 'site': must be files with names"),
     ],
 )
 def test_other_values_are_refused(values, message):

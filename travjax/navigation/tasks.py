@@ -79,6 +79,9 @@ class NavigationConfig:
         require_length("size", self.size, 4, 256)
         for name in ("least", "margin", "threshold"):
             require_number(name, getattr(self, name), 0, 1, "above 0 and at most 1")
+        names = [Path(one.file).stem for one in self.real]  # what tables call their ground
+        twice = next((name for name in names if names.count(name) > 1), None)
+        require(twice is None, "real", twice, "files with names of their own, each named once")
         for name in self.corruptions:
             require(name in CORRUPTIONS, "corruptions", name, f"one of {', '.join(CORRUPTIONS)}")
 
