@@ -76,7 +76,7 @@ SLOW = {
     "resnet/test_network.py": ("test_every_stage_agrees_with_float64",),
     "runs/test_checkpoint.py": ("test_a_kill_at_any_moment_loses_no_checkpoint",),
     "runs/test_model_file.py": ("test_no_bit_that_turned_over_gives_another_estimator",),
-    "simulation/test_events.py": ("test_training_scores_the_four_events",),
+    "simulation/test_events.py": ("[field]",),
     "site/test_kernel.py": (
         "test_at_the_middle_of_a_map_a_primitive_is_a_trajectory[tyre]",
         "test_bits_do_not_depend_on_the_tiles[tyre]",
