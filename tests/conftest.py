@@ -58,7 +58,10 @@ LONGEST = [
 
 
 SLOW = {
-    "commands/test_train.py": ("test_two_processes_of_two_devices",),
+    "commands/test_train.py": (
+        "test_two_processes_of_two_devices",
+        "test_a_run_that_was_interrupted_and_killed_ends_like",
+    ),
     "experiments/test_gpu.py": tuple(
         f"test_{name}"
         for name in (
@@ -68,6 +71,13 @@ SLOW = {
             "the_report_says_how_far",
         )
     ),
+    "experiments/test_transfer.py": ("test_without_real_maps_it_runs_on_stand_ins",),
+    "experiments/test_transfer_runs.py": ("test_without_frozen_trunks_everything_is_trained",),
+    "physics/test_physics.py": ("test_the_experiment_runs_and_goes_on",),
+    "planning/test_oracle.py": (
+        "test_a_bank_is_crossed_straight_where_a_slant_would_turn_the_robot_over[tyre]",
+        "test_a_start_that_is_the_goal[tyre]",
+    ),
     "resnet/test_convolution.py": ("test_four_devices_find", "test_the_gradient_of_a_resnet_is"),
     "resnet/test_imagenet_weights.py": (
         "test_every_stage_of_a_converted_network_is_that_of_torch",
@@ -76,7 +86,12 @@ SLOW = {
     "resnet/test_network.py": ("test_every_stage_agrees_with_float64",),
     "runs/test_checkpoint.py": ("test_a_kill_at_any_moment_loses_no_checkpoint",),
     "runs/test_model_file.py": ("test_no_bit_that_turned_over_gives_another_estimator",),
-    "simulation/test_events.py": ("[field]",),
+    "runs/test_predictor.py": ("test_a_resnet_is_loaded_from_its_run",),
+    "simulation/test_events.py": (
+        "test_training_scores_the_four_events",
+        "test_evaluation_has_tables_and_figures_of_the_four_events",
+        "test_predictions_have_a_probability_of_roll",
+    ),
     "site/test_kernel.py": (
         "test_at_the_middle_of_a_map_a_primitive_is_a_trajectory[tyre]",
         "test_bits_do_not_depend_on_the_tiles[tyre]",
@@ -85,6 +100,7 @@ SLOW = {
     "site/test_mapping.py": ("test_a_cluster_makes_the_same_map",),
     "terrain/test_styles.py": ("test_the_maps_are_the_same_where_float64_is_enabled",),
     "test_cli.py": (
+        "test_rock_fields_are_labelled_and_not_compared_with_the_paper",
         "test_the_program_labels_and_a_second_start_compiles_nothing_anew",
         "test_a_world_makes_the_same_ground_on_a_larger_map_and_is_recorded[label]",
         "test_a_world_makes_the_same_ground_on_a_larger_map_and_is_recorded[dataset]",
@@ -93,11 +109,15 @@ SLOW = {
         f"test_python_of_a_page_runs_and_prints_what_it_says[docs/{page}.md]"
         for page in ("training", "plans", "site-maps")
     ),
+    "test_examples.py": ("test_a_field_is_trained_and_compared", "test_a_figure_of_the_paper_is_drawn"),
     "test_fuzz.py": ("test_a_damaged_file_gives", "test_the_short_campaign_gets"),
     "test_jax_flags.py": ("test_a_run_is_the_same_and_goes_on", "test_a_fresh_process_under_all_flags"),
     "training/test_trainer.py": ("test_a_narrow_trunk_learns_32_samples_by_heart",),
     "traversal/test_traverse.py": ("[unpaired radii-7]", "[fine large map-7]", "[coarse small map-7]"),
-    "traversal/test_tyre.py": ("[Husky, odd turns]", "[without turns, fine]"),
+    "traversal/test_tyre.py": (
+        *("[Husky, odd turns]", "[without turns, fine]"),
+        *(f"test_a_plane_has_no_step_its_own_tilt_and_no_obstacle[{spacing}" for spacing in (0.04, 0.1)),
+    ),
 }
 """Parts of names of tests that take long and check on other input, or as a whole, what quicker tests check too.
 
