@@ -62,14 +62,11 @@ SLOW = {
         "test_two_processes_of_two_devices",
         "test_a_run_that_was_interrupted_and_killed_ends_like",
     ),
-    "experiments/test_gpu.py": tuple(
-        f"test_{name}"
-        for name in (
-            "a_part_that_runs_out_of_time",
-            "all_parts_are_finished",
-            "everything_small_lies_in_the_folder",
-            "the_report_says_how_far",
-        )
+    "experiments/test_gpu.py": (
+        "test_a_part_that_runs_out_of_time",
+        "test_all_parts_are_finished",
+        "test_everything_small_lies_in_the_folder",
+        "test_the_report_says_how_far",
     ),
     "experiments/test_transfer.py": ("test_without_real_maps_it_runs_on_stand_ins",),
     "experiments/test_transfer_runs.py": ("test_without_frozen_trunks_everything_is_trained",),

@@ -7,7 +7,7 @@ from functools import reduce
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, UInt8
+from jaxtyping import Array, Bool, Float, UInt8
 
 from travjax.batching import in_batches
 from travjax.jax_flags import usual_flags
@@ -66,10 +66,23 @@ def places_of(heights: Heights, setup: Setup) -> tuple[Margins, Where]:
     return margins, where
 
 
+@usual_flags()
+def margins_at_once(maps: Float[Array, "n rows cols"], setup: Setup) -> Margins:
+    """Simulates every trajectory of a setup on maps as `margins_of` does, but on all of them in one batch.
+
+    maps: metres, not checked
+    """
+    return _batch(maps, setup, where=False)[0]
+
+
+def _batch(maps: Float[Array, "n rows cols"], setup: Setup, where: bool) -> tuple[Margins, Where | None]:
+    simulate_batch = tyre_margins if setup.contact.model == "tyre" else nearest_margins
+    return simulate_batch(maps, setup, where)
+
+
 def _in_batches(heights: Heights, setup: Setup, where: bool) -> tuple[Margins, Where | None]:
     maps, alone = as_maps(heights, setup.grid)
-    simulate_batch = tyre_margins if setup.contact.model == "tyre" else nearest_margins
-    results = in_batches(lambda batch: simulate_batch(batch, setup, where), maps)
+    results = in_batches(lambda batch: _batch(batch, setup, where), maps)
     return jax.tree.map(lambda result: result[0], results) if alone else results
 
 

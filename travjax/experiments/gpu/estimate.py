@@ -6,6 +6,7 @@ reads its operands from memory and writes its result. What is not counted: launc
 
 from dataclasses import replace
 
+from travjax.estimators.map_estimator import MAPS
 from travjax.estimators.names import FIELD, RESNET
 from travjax.evaluation.tables import rows_table
 from travjax.experiments.gpu.config import Plan
@@ -16,9 +17,6 @@ from travjax.runs.run import Run
 from travjax.simulation.contact import CONTACTS, Contact
 
 DEVICE = "NVIDIA H100 80GB HBM3"
-
-MAPS = 4
-"""Maps that the hazard field reads at once when it predicts."""
 
 COLUMNS = {
     "what": "what",

@@ -24,7 +24,6 @@ from travjax.evaluation.simulator_benchmark import median_time, mixed_maps, terr
 from travjax.experiments.gpu.config import GpuConfig
 from travjax.experiments.gpu.limits import DEVICES, Work
 from travjax.experiments.gpu.programs import prediction, read_program, training_step
-from travjax.jax_flags import usual_flags
 from travjax.runs.run import Run
 from travjax.simulation.contact import CONTACTS, Contact
 from travjax.simulation.footprint import NodeTable, pose_table
@@ -33,9 +32,8 @@ from travjax.simulation.tyre_tables import TyreTable, tyre_table
 from travjax.site.kernel import SiteSetup, Tile, tile_margins, tiles_of
 from travjax.site.primitives import all_poses, straight_passes
 from travjax.training.network_benchmark import Bench
-from travjax.traversal.nearest import nearest_margins
+from travjax.traversal.traverse import margins_at_once
 from travjax.traversal.tyre import ROUNDS
-from travjax.traversal.tyre_trajectories import tyre_margins
 
 COLUMNS = {
     "what": "what",
@@ -145,8 +143,7 @@ class Kernels:
     def _labelling(self, contact: str, maps: int) -> Measured:
         setup = replace(self.run.setup, contact=Contact.from_model(contact))
         heights = mixed_maps(maps, setup)
-        simulate = usual_flags()(tyre_margins if contact == "tyre" else nearest_margins)
-        times = median_time(lambda: simulate(heights, setup, False), self.config.repeats)
+        times = median_time(lambda: margins_at_once(heights, setup), self.config.repeats)
         return Measured(*times, *labelling_work(setup))
 
     def _step(self, size: int) -> Measured:
