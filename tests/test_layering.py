@@ -17,7 +17,7 @@ LAYERS = {
     "rasters": "coordinates reading_options formats raster gdal_files recordings grid_maps array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
-    "resnet": "convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
+    "resnet": "winograd convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
     "fetched_weights",
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
