@@ -17,8 +17,8 @@ LAYERS = {
     "rasters": "coordinates reading_options formats raster gdal_files recordings grid_maps array_files holes surface",
     "point_clouds": "points gridding text_points geokeys laz las ply pcd meshes clouds",
     "data": "dem map_batches sensor_noise sampling provenance dataset_json dataset sites build tfds_export",
-    "resnet": "winograd convolution network stored_arrays keras_files weight_files namings preprocessing imagenet_weights "
-    "fetched_weights",
+    "resnet": "winograd convolution network stored_arrays keras_files weight_files namings preprocessing "
+    "imagenet_weights fetched_weights",
     "models": "variables input_images trajectory_resnet pose_stencil hazard_field",
     "evaluation": "metrics baselines map_figures tables score_figures dataset_tables map_reports simulator_benchmark",
     "site": "primitives ground kernel costs tiling geotiff nav2 store site_figures mapping geometric site_benchmark",
@@ -28,7 +28,7 @@ LAYERS = {
     "planning": "biarcs motions path judges costs endpoints search no_path planner to_go field_judge action_space",
     "plan_results": "path_files route_graph plan_figures plan_report plan_benchmark",
     "navigation": "tasks methods trials scores",
-    "training": "step trainer fit evaluation_report network_benchmark",
+    "training": "step trunk_features trainer fit evaluation_report network_benchmark",
     "physics": "model drive labelling agreement check report",
     "programs": "entry options",
     "experiments": "launch transfer_scores transfer_runs stand_ins robustness robustness_scores synthetic transfer "

@@ -166,30 +166,6 @@ def test_a_run_that_was_interrupted_goes_on_to_the_same_numbers(frozen, trained,
     require_equal(*(saved_state(one.place_of(IMAGENET, 1)) for one in (again, made)))
 
 
-def test_features_of_another_data_set_are_computed_anew(frozen, trained, real, tmp_path):
-    place = tmp_path / "features" / "imagenet.npz"
-    place.parent.mkdir()
-    np.savez(place, dataset="another", training=np.zeros(3))
-    made = Transfer(FROZEN, Run.load(trained), trained, real, tmp_path, frozen[0].devices)
-    assert made.rows(IMAGENET, 0)[-1]["eval_sets"] == frozen[1][IMAGENET][0][-1]["eval_sets"]
-    with np.load(place) as file:
-        assert str(file["dataset"]) == real.fingerprint
-
-
-@pytest.mark.parametrize("damage", ["missing", "no archive", "half of it", "a folder"])
-def test_a_damaged_file_of_features_counts_as_none(tmp_path, damage):
-    path = tmp_path / "imagenet.npz"
-    np.savez(path, dataset="this", training=np.zeros(3))
-    assert str(transfer_runs._read_features(path)["dataset"]) == "this"
-    data = path.read_bytes()
-    path.unlink()
-    if damage == "a folder":
-        path.mkdir()
-    elif damage != "missing":
-        path.write_bytes(b"\x93NUMPY" if damage == "no archive" else data[: len(data) // 2])
-    assert transfer_runs._read_features(path) == {}
-
-
 def test_scores_of_a_finished_run_that_are_damaged_are_one_line(frozen, trained, real, tmp_path):
     made = frozen[0]
     copied = tmp_path / "transfer"

@@ -229,16 +229,15 @@ def test_the_features_of_the_frozen_trunk_are_those_of_a_forward_pass(tmp_path):
         np.testing.assert_allclose(made.features[name], wanted, rtol=1e-4, atol=1e-5)
 
 
-def test_features_of_another_run_of_the_same_trunk_may_be_given(tmp_path, monkeypatch):
-    first = begun(tmp_path / "first", head_epochs=1, epochs=0)
-    features = first.features
-    first.train()
-    monkeypatch.setattr("travjax.estimators.trajectory_estimator.over_samples", None)  # what would compute them
-    (tmp_path / "second").mkdir()
-    run = run_of(head_epochs=1, epochs=0)
-    second = Trainer(run, dataset(), tmp_path / "second", Devices.all(), quiet=True, features=features)
-    second.start(run.create(second.config.seed))
-    second.train()
+def test_other_runs_of_the_same_trunk_take_its_features_from_the_file(tmp_path, monkeypatch):
+    runs = {}
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+        run, file = run_of(head_epochs=1, epochs=0), tmp_path / "features.npz"
+        runs[name] = Trainer(run, dataset(), tmp_path / name, Devices.all(), quiet=True, features=file)
+        runs[name].start(run.create(runs[name].config.seed))
+        runs[name].train()
+        monkeypatch.setattr("travjax.estimators.trajectory_estimator.over_samples", None)  # what would compute them
     assert rows_of(tmp_path / "first") == rows_of(tmp_path / "second")
 
 

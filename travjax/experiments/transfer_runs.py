@@ -11,7 +11,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 from flax import nnx
 
 from travjax.config import InputError, require
@@ -19,7 +18,7 @@ from travjax.data.dataset import Dataset
 from travjax.data.sampling import Samples, natural_sample
 from travjax.devices import Devices
 from travjax.estimators.preset import MOST, TrainingConfig, find_weights
-from travjax.files import output_folder, save_npz
+from travjax.files import output_folder
 from travjax.jax_flags import key_of
 from travjax.models.trajectory_resnet import Estimator, Heads, create
 from travjax.models.variables import Network
@@ -168,7 +167,7 @@ class Transfer:
 
     def _train(self, arm: str, seed: int, place: Path, until: float) -> bool:
         run = self.run_of(arm, seed)
-        features = self._kept_features(arm)
+        features = output_folder(self.folder / "features") / f"{_name(arm)}.npz" if self.config.frozen else None
         trainer = Trainer(
             run, self.dataset, output_folder(place), self.devices, eval_sets=self.held_out, features=features
         )
@@ -178,9 +177,6 @@ class Transfer:
             trainer.resume()
         else:
             trainer.start(self._first(arm, seed))
-        if self.config.frozen and features is None:
-            path = self._features_file(arm)
-            save_npz(output_folder(path.parent) / path.name, dataset=self.dataset.fingerprint, **trainer.features)
         return trainer.train(until)
 
     def _first(self, arm: str, seed: int) -> Network:
@@ -196,24 +192,6 @@ class Transfer:
         made, events = create(preset.trunk, preset.heads, trunk_seed, weights), self.base.robot.event_names
         rngs = nnx.Rngs(key_of(seed + 1))
         return Estimator(made.trunk, Heads(preset.trunk.features, preset.heads, events, rngs=rngs))
-
-    def _features_file(self, arm: str) -> Path:
-        """Returns the path of an arm's features, which its other seeds and a resumed run use again."""
-        return self.folder / "features" / f"{_name(arm)}.npz"
-
-    def _kept_features(self, arm: str) -> dict[str, np.ndarray] | None:
-        """Reads the features of an arm's frozen trunk on this data set; None where they have yet to be computed."""
-        kept = _read_features(self._features_file(arm)) if self.config.frozen else {}
-        return kept if str(kept.pop("dataset", None)) == self.dataset.fingerprint else None
-
-
-def _read_features(path: Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of a file of features; none where it is missing or damaged, since they can be made anew."""
-    try:
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return dict(file)
-    except Exception:  # NumPy and zipfile raise many kinds of errors for a damaged file
-        return {}
 
 
 def _name(arm: str) -> str:

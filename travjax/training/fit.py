@@ -24,6 +24,9 @@ from travjax.runs.run_log import read_rows
 from travjax.simulation.setup import Setup
 from travjax.training.trainer import Trainer
 
+FEATURES = "features.npz"
+"""File in the folder of a run that keeps the features of the frozen trunk while phase 1 lasts."""
+
 
 def run_from_preset(
     preset: Preset | str | Path,
@@ -101,7 +104,8 @@ def _fit(
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
     estimator = None if resumes else wanted.create(preset.training.seed, weights)
-    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices)
+    features = folder / FEATURES
+    trainer = Trainer(wanted, _dataset(data, wanted, folder, devices), folder, devices, features=features)
     output_folder(folder)
     if devices.main:
         wanted.save(folder)
@@ -112,7 +116,11 @@ def _fit(
         trainer.start(estimator)
         if devices.main and wanted.kind.sees_images:
             progress.wrote(_draw_inputs(trainer, folder))
-    finished = trainer.train(until)
+    try:
+        finished = trainer.train(until)
+    finally:
+        if devices.main and trainer.position.phase == 2:
+            features.unlink(missing_ok=True)  # gigabytes for a large data set, and of no more use
     if devices.main:
         _finish(folder, wanted)
     return finished

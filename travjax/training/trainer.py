@@ -33,6 +33,7 @@ from travjax.runs.checkpoint import Checkpoints
 from travjax.runs.run import Run, checked_meta
 from travjax.runs.run_log import RunLog
 from travjax.training.step import State, StepSettings, is_finite, update
+from travjax.training.trunk_features import Features, kept, origin_of
 
 IN_FLIGHT = 2
 """Steps whose loss the host has not read yet: the device works while the host prepares the next batch."""
@@ -64,7 +65,8 @@ class Trainer:
     data: what is trained on; state: that of step.py; position: where it stands
     eval_sets: named samples on which each epoch is scored beside the validation, and the first state; training does not
         depend on them
-    features: of the frozen trunk, as `features` of another run of the same trunk and samples; else they are computed
+    features: file that keeps the features of the frozen trunk, for this run resumed or others of the same trunk and
+        samples; they are kept in memory only where it is None, and where several processes train
     Raises InputError when the data set is not for the run's robot, action space and grid, when it has no training or no
     validation samples, or when the devices cannot share a batch.
     """
@@ -77,7 +79,7 @@ class Trainer:
         devices: Devices,
         quiet: bool = False,
         eval_sets: Mapping[str, Samples] | None = None,
-        features: Mapping[str, np.ndarray] | None = None,
+        features: Path | None = None,
     ):
         dataset.setup.require_same(run.setup, "data set")
         devices.check_batch(run.preset.training.batch_size)
@@ -88,7 +90,7 @@ class Trainer:
         self.scored = {"validation": self.data.validation} | dict(eval_sets or {})
         self.checkpoints = Checkpoints(folder / "checkpoints")
         self.position = Position()
-        self._given_features = features
+        self._features_file = features if jax.process_count() == 1 else None
         self._optimizers: dict[int, optax.GradientTransformation] = {}
         self.graph = run.graph()
         self.log: RunLog | None = None
@@ -106,13 +108,16 @@ class Trainer:
         return self.kind.phases[self.position.phase]
 
     @cached_property
-    def features(self) -> Mapping[str, np.ndarray]:
-        """The features of a frozen trunk by the names of the samples, computed once unless they were given."""
-        if self._given_features is not None:
-            return self._given_features
+    def features(self) -> Features:
+        """The features of a frozen trunk by the names of the samples, computed unless the file of them has them."""
         frozen, samples = self.phase.frozen_trunk, {"training": self.data.samples(1, 0)} | self.scored
         assert frozen, "only asked for in a phase with a frozen trunk"
-        return {name: self._over(frozen.features, part, f"{name} features") for name, part in samples.items()}
+        compute = lambda: {
+            name: self._over(frozen.features, part, f"{name} features") for name, part in samples.items()
+        }
+        if self._features_file is None:
+            return compute()
+        return kept(self._features_file, origin_of(self.data.dataset.fingerprint, self._variables, samples), compute)
 
     @usual_flags()
     def start(self, estimator: Network) -> None:
@@ -176,8 +181,6 @@ class Trainer:
         """Begins a phase with a new optimizer for the parts that it trains."""
         self.position.phase, self.position.epoch = phase, 0
         self.__dict__.pop("features", None)  # they take gigabytes for a large data set
-        if not self.phase.frozen_trunk:
-            self._given_features = None
         trained = {name: self.state[name] for name in self.phase.trained}
         optimizer = self.devices.replicate(self._optimizer(phase).init(trained))
         self.state = self._variables | {"optimizer": optimizer}
