@@ -19,7 +19,7 @@ export TRAVJAX_DATA
 help:
 	@echo "make setup   create $(VENV) with everything that the other targets need"
 	@echo "make label   make and label 200 synthetic maps and the Mars Yard, into $(OUT)/label"
-	@echo "make train   train an estimator and evaluate it, into $(RUN); PRESET=smoke|laptop|paper ($(PRESET)),"
+	@echo "make train   train an estimator and evaluate it, into $(RUN); PRESET=smoke|laptop|workstation|paper ($(PRESET)),"
 	@echo "             MODEL=resnet50|field ($(MODEL)); resnet50 begins with ImageNet weights: WEIGHTS=FILE, those of"
 	@echo "             TRAVJAX_DATA or of the cache, else they are fetched (95 MB); WEIGHTS=none for random ones"
 	@echo "             on an NVIDIA GPU: make clean, then make train PRESET=paper EXTRAS=dev,cuda"
@@ -62,7 +62,7 @@ train: setup
 	$(BIN)/travjax train $(PRESET) --model $(MODEL) $(if $(WEIGHTS),--weights $(WEIGHTS)) --resume --out $(RUN)
 	$(BIN)/travjax evaluate $(RUN)
 	@echo
-	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
+	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=workstation (3 hours), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
 	@echo "The hazard field: make train MODEL=field PRESET=smoke (1 minute), PRESET=laptop (an hour); it needs no ImageNet weights."
 	@echo "Another robot: $(BIN)/travjax train $(PRESET) --model $(MODEL) --robot husky_a200 --out DIR"
 

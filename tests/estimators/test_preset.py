@@ -15,7 +15,7 @@ from travjax.data.sensor_noise import CorruptionConfig
 from travjax.estimators.names import ESTIMATORS
 from travjax.estimators.preset import IMAGENET_WEIGHTS, EvaluationConfig, Preset, TrainingConfig, find_weights
 from travjax.experiments.transfer_runs import TransferConfig
-from travjax.files import PRESETS
+from travjax.files import PRESETS, find_preset
 from travjax.models.hazard_field import FieldConfig
 from travjax.models.trajectory_resnet import HeadsConfig
 from travjax.resnet.fetched_weights import KEPT
@@ -120,8 +120,17 @@ def test_the_presets_of_the_hazard_field_are_right(path):
     assert steps > 3 * preset.training.warmup_steps
 
 
-def test_both_models_have_the_same_presets():
-    assert [path.stem for path in FIELDS] == [path.stem for path in RESNETS] == ["laptop", "paper", "smoke"]
+def test_both_models_have_the_same_presets_but_one():
+    assert [path.stem for path in FIELDS] == ["laptop", "paper", "smoke"]
+    assert [path.stem for path in RESNETS] == ["laptop", "paper", "smoke", "workstation"]
+
+
+def test_a_workstation_trains_on_five_times_the_maps_of_a_laptop():
+    laptop, workstation = (Preset.load(find_preset(name, "resnet50")) for name in ("laptop", "workstation"))
+    assert workstation.dataset.maps == 5 * laptop.dataset.maps
+    same = {"validation_samples": 1}
+    assert replace(workstation.training, **same) == replace(laptop.training, **same)
+    assert workstation.trunk == ResNetConfig(momentum=0.99)  # it takes thousands of steps
 
 
 def test_there_is_a_preset_of_the_paper():

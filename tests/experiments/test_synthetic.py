@@ -163,7 +163,7 @@ def refusal(*words) -> str:
 def test_a_preset_that_is_not_there_is_one_line(place, tmp_path, monkeypatch):
     monkeypatch.chdir(place)
     said = refusal("small", "--out", tmp_path / "out")
-    assert said == "preset small: no such resnet50 preset; allowed: laptop, paper, smoke, or a .toml file"
+    assert said == "preset small: no such resnet50 preset; allowed: laptop, paper, smoke, workstation, or a .toml file"
     assert files(tmp_path) == set()
 
 

@@ -23,7 +23,7 @@ def add(commands: options.Commands) -> None:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper, or a .toml file (laptop)",
+        help="smoke, laptop, workstation (ResNet50 only) or paper, or a .toml file (laptop)",
     )
     parser.add_argument("--model", choices=ESTIMATORS, help="the estimator: of a named preset, one of both (resnet50)")
     options.add_run(parser)

@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         nargs="?",
         default="laptop",
         metavar="PRESET",
-        help="smoke, laptop or paper, or a .toml file (laptop)",
+        help="smoke, laptop, workstation or paper, or a .toml file (laptop)",
     )
     options.add_run(parser)
     parser.add_argument(
