@@ -389,3 +389,28 @@ def test_json_of_what_is_not_finite_is_null():
     assert metrics.json_ready({"a": [math.nan, math.inf, np.float32(1.5), np.int64(3), True, None, "b"]}) == {
         "a": [None, None, 1.5, 3, True, None, "b"]
     }
+
+
+def test_the_recall_at_a_precision_is_the_largest_that_keeps_it():
+    curve = metrics.Curve(
+        np.array([0.9, 0.8, 0.5, 0.1]), np.array([0.5, 1.0, 0.75, 0.6]), np.array([0.2, 0.4, 0.6, 1.0])
+    )
+    assert [curve.recall_at_precision(wanted) for wanted in (0.5, 0.7, 0.75, 0.76, 1.0)] == [1.0, 0.6, 0.6, 0.4, 0.4]
+    assert metrics.Curve(*np.array([[0.9], [0.5], [1.0]])).recall_at_precision(0.6) == 0
+    empty = np.zeros(0)
+    assert math.isnan(metrics.Curve(empty, empty, empty).recall_at_precision(0.5))
+
+
+def test_recalls_are_given_at_the_precisions_that_the_paper_reports():
+    probabilities, failed = sample()
+    found = evaluate(probabilities, failed).recall_at_paper_precision
+    assert tuple(found) == NAMES
+    for e, event in enumerate(EVENTS):
+        curve = metrics.precision_recall_curve(probabilities[:, e], failed[:, e])
+        assert found[event] == curve.recall_at_precision(metrics.PAPER_SYNTHETIC[event].precision)
+    assert list(evaluate(probabilities, failed, paper=PAPER_REAL).recall_at_paper_precision) == [
+        "step",
+        "obstacle",
+        "overall",
+    ]
+    assert evaluate(probabilities, failed, paper=None).recall_at_paper_precision == {}

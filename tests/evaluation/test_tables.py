@@ -5,13 +5,14 @@ import re
 import numpy as np
 import pytest
 
-from travjax.evaluation.metrics import PAPER_REAL, evaluate
+from travjax.evaluation.metrics import PAPER_REAL, PAPER_SYNTHETIC, evaluate
 from travjax.evaluation.tables import (
     PAPER_SHARES,
     baselines_table,
     calibration_line,
     groups_table,
     metrics_table,
+    paper_table,
     rows_table,
     shares_table,
     threshold_table,
@@ -206,6 +207,17 @@ def test_thresholds_are_those_worked_out_by_hand():
     assert rows["tilt", "0.500"] == ["-", "-", "-", "-", "-", ""]
     assert rows["tilt", "0.989"][-1] == "0.474"
     assert rows["overall", "0.944"][-1] == "0.684"
+    assert notes(table) == ["tilt: no sample fails, so the figures with a dash are undefined"]
+
+
+def test_precision_and_recall_at_the_papers_are_those_worked_out_by_hand():
+    table = paper_table(evaluate(*ten_samples()), PAPER_SYNTHETIC)
+    assert {row[0]: row[1:] for row in lines(table)} == {
+        "step": ["0.937", "0.640", "0.800", "1.000"],
+        "obstacle": ["0.949", "0.770", "0.200", "0.000"],
+        "tilt": ["0.989", "0.474", "-", "-"],
+        "overall": ["0.944", "0.684", "0.200", "0.667"],
+    }
     assert notes(table) == ["tilt: no sample fails, so the figures with a dash are undefined"]
 
 

@@ -125,6 +125,12 @@ class Curve:
             return math.nan
         return float(self.threshold[np.searchsorted(self.recall, recall)])
 
+    def recall_at_precision(self, precision: float) -> float:
+        """Returns the largest recall at that precision or a higher one, 0 where it is not reached; NaN if empty."""
+        if not len(self.recall):
+            return math.nan
+        return float(self.recall[self.precision >= precision].max(initial=0.0))
+
     def thinned(self, points: int = CURVE_POINTS) -> "Curve":
         """Keeps at most that many points, spread evenly over the curve, with both ends."""
         last = len(self.recall) - 1
@@ -179,6 +185,7 @@ class Evaluation:
     any_failure: share of the samples with any failure; curves keep CURVE_POINTS points
     points:      operating points at each wanted recall and at the paper's recall, by increasing recall
     groups:      for each group of samples, scores by event and "overall"
+    recall_at_paper_precision: the largest recall at the precision that the paper reports, where it reports one
     """
 
     samples: int
@@ -189,6 +196,7 @@ class Evaluation:
     points: dict[str, tuple[OperatingPoint, ...]]
     calibration: dict[str, Calibration]
     groups: dict[str, dict[str, Scores]] = field(default_factory=dict)
+    recall_at_paper_precision: dict[str, float] = field(default_factory=dict)
 
     @property
     def average_precision(self) -> dict[str, float]:
@@ -287,6 +295,11 @@ def evaluate(
         points={name: _points(*column, curves[name], wanted[name]) for name, column in columns.items()},
         calibration={name: calibration(*column) for name, column in columns.items()},
         groups={} if groups is None else _of_groups(columns, groups, threshold),
+        recall_at_paper_precision={
+            name: curve.recall_at_precision(paper[name].precision)
+            for name, curve in curves.items()
+            if paper and name in paper and paper[name].precision > 0
+        },
     )
 
 

@@ -140,6 +140,18 @@ def threshold_table(evaluation: Evaluation, paper: Mapping[str, Confusion] | Non
     return with_notes(_table(rows, headers), notes)
 
 
+def paper_table(evaluation: Evaluation, paper: Mapping[str, Confusion]) -> str:
+    """Tabulates the precision at the paper's recall and the recall at the paper's precision, beside the paper's."""
+    rows, notes = [], []
+    for name, recall in evaluation.recall_at_paper_precision.items():
+        counts = paper[name]
+        at_its_recall = next(point.confusion for point in evaluation.points[name] if _is_of(counts, point))
+        rows.append([name, *map(_share, (counts.recall, counts.precision, at_its_recall.precision, recall))])
+        notes.append(_why_undefined(name, at_its_recall))
+    headers = ["", "paper's recall", "paper's precision", "precision at its recall", "recall at its precision"]
+    return with_notes(_table(rows, headers), notes)
+
+
 def calibration_line(evaluation: Evaluation) -> str:
     """Compares mean probability with measured failure frequency in one line, and says which way they are off."""
     over = lambda bins, values: float(np.nansum(bins.count * values) / bins.count.sum())

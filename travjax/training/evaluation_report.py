@@ -122,6 +122,7 @@ def _write_tables(
         (headline + "step {steps}").format(**description),
         tables.metrics_table(scores, paper),
         tables.threshold_table(scores, paper),
+        *([tables.paper_table(scores, paper)] if paper and scores.recall_at_paper_precision else []),
         tables.calibration_line(scores),
         tables.groups_table(scores),
         tables.baselines_table(average_precisions),
