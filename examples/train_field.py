@@ -17,7 +17,6 @@ import numpy as np
 
 import travjax
 from travjax.data.sensor_noise import noisy
-from travjax.files import find_preset
 
 NOISE = 0.03
 """Metres, standard deviation of the noise at each node."""
@@ -31,7 +30,7 @@ def f1(predicted: np.ndarray, failed: np.ndarray) -> float:
 def main(preset: str = "smoke", out: str = "runs/examples/field", maps: int = 20) -> None:
     """Trains a preset of the hazard field into a folder, and prints F1 on noisy maps."""
     if not Path(out, "training.png").exists():
-        travjax.fit(travjax.run_from_preset(find_preset(preset, "field")), out, resume=True)
+        travjax.fit(travjax.run_from_preset(preset, model="field"), out, resume=True)
     clean = np.asarray(travjax.generate_terrain("rough", range(9000, 9000 + maps)))
     noise = np.random.default_rng(0)
     seen = noisy(clean, NOISE, noise)

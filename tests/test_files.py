@@ -198,7 +198,11 @@ def test_a_preset_is_found_by_its_path(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("given", "kind", "message"),
     [
-        ("big", "resnet50", "preset big: no such resnet50 preset; allowed: laptop, paper, smoke, or a .toml file"),
+        (
+            "big",
+            "resnet50",
+            "preset big: no such resnet50 preset; allowed: laptop, paper, smoke, workstation, or a .toml file",
+        ),
         ("real", "field", "preset real: no such field preset; allowed: laptop, paper, smoke, or a .toml file"),
         ("../field/laptop", "field", "preset ../field/laptop: no such field preset; allowed: laptop, paper, smoke, or"),
         ("laptop", "sites", "preset laptop: no such sites preset; allowed: real, real_upright, stand_in, or a"),

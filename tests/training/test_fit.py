@@ -7,6 +7,8 @@ import pytest
 from tests.commandline import files
 from tests.small_training import PRESET, SETUP, TOML, copy, rows_of
 from travjax.config import InputError
+from travjax.estimators.preset import Preset
+from travjax.files import find_preset
 from travjax.runs.run import Run
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.grid import Grid
@@ -28,6 +30,18 @@ def test_what_differs_from_the_preset_is_taken(tmp_path, few):
     assert (run.robot.name, run.preset.robot, run.preset.weights) == ("Leo Rover", "leo_rover", "w.npz")
     assert run.preset.dataset.seed == run.preset.training.seed == 7
     assert run.preset.heads == PRESET.heads
+
+
+def test_a_preset_that_comes_with_travjax_is_named(tmp_path):
+    assert run_from_preset("smoke").preset == Preset.load(find_preset("smoke", "resnet50"))
+    assert run_from_preset("smoke", model="field").preset == Preset.load(find_preset("smoke", "field"))
+    with pytest.raises(InputError, match="^preset none: no such field preset; allowed: laptop, "):
+        run_from_preset("none", model="field")
+    with pytest.raises(InputError, match="^model = 'resnet': must be one of resnet50, field$"):
+        run_from_preset("smoke", model="resnet")
+    (tmp_path / "tiny.toml").write_text(TOML)
+    with pytest.raises(InputError, match="^model = 'field': must be resnet50, as .*tiny.toml says$"):
+        run_from_preset(tmp_path / "tiny.toml", model="field")
 
 
 def test_a_run_goes_on_only_where_it_is_told_to(trained, tmp_path, capsys):

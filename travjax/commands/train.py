@@ -5,8 +5,8 @@ from pathlib import Path
 
 from travjax import options
 from travjax.config import one_line, require
-from travjax.estimators.names import ESTIMATORS, RESNET
-from travjax.files import find_preset, user_path
+from travjax.estimators.names import ESTIMATORS
+from travjax.files import user_path
 from travjax.signals import going_on
 
 
@@ -49,7 +49,7 @@ def add(commands: options.Commands) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Trains, alone or as one of several processes."""
     from travjax.devices import Devices, join
-    from travjax.estimators.preset import Preset
+    from travjax.estimators.preset import load_preset
     from travjax.training.fit import fit
 
     shared = (arguments.coordinator, arguments.processes, arguments.process)
@@ -58,11 +58,9 @@ def run(arguments: argparse.Namespace) -> None:
         require(given, "--coordinator, --processes, --process", shared, "all three or none")
         join(*shared)
     devices = Devices.all()
-    path = find_preset(arguments.preset, arguments.model or RESNET)
-    preset, data = Preset.load(path), arguments.data
-    require(arguments.model in (None, preset.model), "--model", arguments.model, f"{preset.model}, as {path} says")
+    preset, data = load_preset(arguments.preset, arguments.model), arguments.data
     wanted = options.run_of(preset, arguments)
-    folder = arguments.out or Path("runs") / ESTIMATORS[preset.model].folder / path.stem
+    folder = arguments.out or Path("runs") / ESTIMATORS[preset.model].folder / Path(arguments.preset).stem
     with going_on("with --resume the same command goes on from the latest checkpoint"):
         fit(wanted, folder, devices, data, resume=arguments.resume, option="--resume")
     if devices.main:

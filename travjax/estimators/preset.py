@@ -9,7 +9,7 @@ from travjax.config import InputError, load_toml, require, require_length, requi
 from travjax.data.dataset import DatasetConfig
 from travjax.data.sensor_noise import CorruptionConfig
 from travjax.estimators.names import ESTIMATORS, RESNET
-from travjax.files import find_data
+from travjax.files import find_data, find_preset
 from travjax.models.hazard_field import FieldConfig
 from travjax.models.trajectory_resnet import HeadsConfig
 from travjax.resnet.fetched_weights import fetched_weights
@@ -183,6 +183,20 @@ class Preset:
     def load(path: str | Path) -> "Preset":
         """Reads a preset from a TOML file; raises InputError when it is missing or wrong."""
         return load_toml(path, Preset)
+
+
+def load_preset(given: str | Path, model: str | None = None) -> Preset:
+    """Reads a preset that comes with travjax by its name, or a TOML file.
+
+    model: the estimator whose preset the name is, the ResNet unless given; a file must be of it
+    Raises InputError when there is none of that name, and when the file is missing, wrong or of another estimator.
+    """
+    names = list(ESTIMATORS)
+    require(model is None or model in names, "model", model, f"one of {', '.join(names)}")
+    path = find_preset(given, model or RESNET)
+    preset = Preset.load(path)
+    require(model in (None, preset.model), "model", model, f"{preset.model}, as {path} says")
+    return preset
 
 
 def find_weights(name: str) -> Path | None:

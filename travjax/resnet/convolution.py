@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from travjax.resnet import winograd
+from travjax.resnet.winograd import flattened
 
 WIDE = 128
 """Channels from which on a 3 x 3 convolution and its gradients are faster by Winograd's method than by XLA's."""
@@ -61,11 +62,6 @@ def _correlate(images, kernel, stride: int, padding: int):
     )
 
 
-def _flat(images):
-    """Reshapes to [pixels, channels] in memory, so that what comes before is not fused into what follows."""
-    return lax.optimization_barrier(images.reshape(-1, images.shape[-1]))
-
-
 @jax.custom_vjp
 def _pointwise(images, kernel):
     """Computes a 1 x 1 convolution as one matrix product, so that its gradients are matrix products as well."""
@@ -73,13 +69,13 @@ def _pointwise(images, kernel):
 
 
 def _pointwise_forward(images, kernel):
-    pixels = _flat(images)
+    pixels = flattened(images)
     return (pixels @ kernel[0, 0]).reshape(*images.shape[:-1], -1), (pixels, kernel)
 
 
 def _pointwise_backward(saved, gradient):
     pixels, kernel = saved
-    flat = _flat(gradient)
+    flat = flattened(gradient)
     of_images = lax.dot_general(flat, kernel[0, 0], (((1,), (1,)), ((), ())))
     of_kernel = lax.dot_general(pixels, flat, (((0,), (0,)), ((), ())))
     return of_images.reshape(*gradient.shape[:-1], -1), of_kernel[None, None]
@@ -137,7 +133,7 @@ def _strided_backward(stride: int, padding: int, saved, gradient):
     images, kernel = saved
     of_images = jax.linear_transpose(lambda i: _correlate(i, kernel, stride, padding), images)(gradient)[0]
     patches = jnp.concatenate(list(_window_places(images, gradient.shape, kernel.shape, stride, padding, 0)), axis=-1)
-    of_kernel = lax.dot_general(_flat(patches), _flat(gradient), (((0,), (0,)), ((), ())))
+    of_kernel = lax.dot_general(flattened(patches), flattened(gradient), (((0,), (0,)), ((), ())))
     return of_images, of_kernel.reshape(kernel.shape)
 
 

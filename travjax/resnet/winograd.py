@@ -52,7 +52,7 @@ def gradients(saved: Saved, gradient: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _transform(matrix: Matrix, grid: Grid) -> Grid:
     """Returns matrix @ grid @ matrix^T, its arrays in memory as [n, channels]."""
     columns = [[_combined(weights, column) for weights in matrix] for column in zip(*grid, strict=True)]
-    return [[_flat(_combined(weights, row)) for weights in matrix] for row in zip(*columns, strict=True)]
+    return [[flattened(_combined(weights, row)) for weights in matrix] for row in zip(*columns, strict=True)]
 
 
 def _combined(weights: Iterable[float], arrays: Iterable[jax.Array]) -> jax.Array:
@@ -127,6 +127,6 @@ def _interleaved(grid: Grid) -> jax.Array:
     return whole.reshape(count, 2 * down, 2 * across, channels)
 
 
-def _flat(array: jax.Array) -> jax.Array:
-    """Reshapes to [n, channels] in memory, so that XLA computes it once and on all cores."""
+def flattened(array: jax.Array) -> jax.Array:
+    """Reshapes to [n, channels] in memory, so that XLA does not fuse what comes before into what follows."""
     return lax.optimization_barrier(array.reshape(-1, array.shape[-1]))

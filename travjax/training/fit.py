@@ -13,7 +13,7 @@ from travjax.data import dataset
 from travjax.data.build import build_synthetic
 from travjax.data.dataset import Dataset
 from travjax.devices import Devices
-from travjax.estimators.preset import Preset, find_weights
+from travjax.estimators.preset import Preset, find_weights, load_preset
 from travjax.evaluation import map_figures, score_figures
 from travjax.files import held, output_folder, put_back, user_path
 from travjax.jax_flags import usual_flags
@@ -31,6 +31,7 @@ FEATURES = "features.npz"
 def run_from_preset(
     preset: Preset | str | Path,
     *,
+    model: str | None = None,
     robot: str | None = None,
     actions: str | Path | None = None,
     size: float = 8.0,
@@ -42,14 +43,15 @@ def run_from_preset(
 ) -> Run:
     """Returns the run of a preset, with any settings that are to differ from it.
 
-    preset:  a preset, or its TOML file
+    preset:  a preset, its TOML file, or the name of one that comes with travjax, such as "laptop"
+    model:   "resnet50" or "field", whose preset a name is; the ResNet's unless given
     robot, actions, size, spacing, contact, turn: as `Setup.load` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
     seed:    seed of the data set and of training
-    Raises InputError when a file is missing or wrong, when robot, action space and map do not fit together, and for a
-    seed out of range.
+    Raises InputError when there is no preset of that name, when a file is missing or wrong, when robot, action space
+    and map do not fit together, and for a seed out of range.
     """
-    preset = preset if isinstance(preset, Preset) else Preset.load(preset)
+    preset = preset if isinstance(preset, Preset) else load_preset(preset, model)
     if weights:
         preset = replace(preset, weights=weights)
     if seed is not None:
