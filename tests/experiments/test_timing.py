@@ -208,15 +208,29 @@ def test_the_sequential_simulator_s_time_is_the_median_of_its_calls(monkeypatch)
     assert done == [*range(1, 19)] * 3
 
 
-def test_the_processor_is_named_in_one_line(monkeypatch):
+def test_the_processor_is_named_in_one_line():
     assert len(simulator_benchmark.processor().splitlines()) == 1
 
-    def unreadable(path):
-        raise OSError
 
-    monkeypatch.setattr(Path, "read_text", unreadable)
+@pytest.mark.parametrize(
+    ("described", "name"),
+    [
+        ("processor: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\n", "AMD EPYC (family 25, model 17)"),
+        ("model name: A (B)\ncpu family: 6\nmodel: 143\n\nmodel name: C\nmodel: 2\n", "A (B) (family 6, model 143)"),
+        ("processor: 0\nmodel name\t: ARMv7 Processor\n", "ARMv7 Processor"),
+        ("processor: 0\nBogoMIPS: 50\n", None),
+        (None, None),
+    ],
+)
+def test_the_processor_has_its_generation_where_the_system_gives_it(monkeypatch, described, name):
+    def read(path):
+        if described is None:
+            raise OSError
+        return described
+
+    monkeypatch.setattr(Path, "read_text", read)
     monkeypatch.setattr(simulator_benchmark.platform, "processor", lambda: "")
-    assert simulator_benchmark.processor() == simulator_benchmark.platform.machine() != ""
+    assert simulator_benchmark.processor() == (name or simulator_benchmark.platform.machine()) != ""
 
 
 # ---- Bad input
