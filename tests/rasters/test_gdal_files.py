@@ -249,6 +249,15 @@ def test_a_vrt_reads_no_other_file_whatever_it_is_called(tmp_path, suffix):
     np.testing.assert_array_equal(read(path, gdal_drivers=("VRT",)), HEIGHTS)
 
 
+def test_a_driver_that_gdal_does_not_have_is_refused(tmp_path):
+    path = write(tmp_path / "a.tif")
+    np.testing.assert_array_equal(read(path, gdal_drivers=("vrt",)), HEIGHTS)
+    assert refusal(path, gdal_drivers=("VRT", "VTR")) == (
+        "gdal_drivers = 'VTR': must be a driver of GDAL by its short name, such as BAG, of those that rasterio was "
+        "built with"
+    )
+
+
 @pytest.mark.parametrize("name", ["a.tif.msk", "a.msk", "a.tif.ovr"])
 def test_what_gdal_would_open_beside_a_raster_must_be_a_tiff(tmp_path, name):
     path = write(tmp_path / "a.tif")

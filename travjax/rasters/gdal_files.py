@@ -7,7 +7,7 @@ and a file beside the raster that GDAL would open by itself is looked at first.
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -48,14 +48,15 @@ CACHE_MIB = 256
 def read_raster(path: Path, options: DemOptions) -> Raster:
     """Reads one band of a raster as heights; options as `load_dem` takes them.
 
-    Raises InputError when rasterio is not installed, when the file cannot be read or refers to others, is a picture
-    without its scales, is in degrees, feet or another system whose metre is none on the ground, or does not run east
-    and, without rotation, north or south.
+    Raises InputError when rasterio is not installed, for a driver that GDAL does not have, when the file cannot be read
+    or refers to others, is a picture without its scales, is in degrees, feet or another system whose metre is none on
+    the ground, or does not run east and, without rotation, north or south.
     """
     _require_closed(path)
     if not str(path).isprintable() and any("\ud800" <= letter <= "\udfff" for letter in str(path)):
         raise InputError("name: must be UTF-8, which GDAL wants; rename the file")
-    with _gdal():
+    with _gdal() as drivers:
+        _require_known(options.gdal_drivers, drivers)
         file, placed = _opened(str(path.absolute()), (*DRIVERS, *options.gdal_drivers))
         if not file.count and file.subdatasets:
             file, placed = _variable(path, file, options.band)
@@ -84,16 +85,16 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
 
 
 @contextmanager
-def _gdal() -> Iterator[None]:
-    """Configures GDAL, and turns whatever it cannot read into one line."""
+def _gdal() -> Iterator[Collection[str]]:
+    """Configures GDAL, and turns whatever it cannot read into one line; yields the names of its drivers."""
     try:
         import rasterio
     except ImportError:
         raise InputError("reading it needs rasterio: pip install rasterio; .npy and .npz need nothing") from None
     try:
-        with rasterio.Env(GDAL_CACHEMAX=CACHE_MIB, AAIGRID_DATATYPE="Float64"):
+        with rasterio.Env(GDAL_CACHEMAX=CACHE_MIB, AAIGRID_DATATYPE="Float64") as gdal:
             _use_own_database()
-            yield
+            yield gdal.drivers()
     except rasterio.errors.RasterioError as error:
         raise InputError(f"not a raster that can be read: {_first_line(error.__cause__ or error)}") from None
 
@@ -115,6 +116,14 @@ def _use_own_database() -> None:
     except rasterio.errors.CRSError as error:
         data = {name: os.environ[name] for name in ("PROJ_DATA", "PROJ_LIB") if name in os.environ}
         raise InputError(f"PROJ, as rasterio uses it, finds no coordinate systems with {data}: {error}") from None
+
+
+def _require_known(names: tuple[str, ...], drivers: Collection[str]) -> None:
+    """Raises InputError for a name of no driver; GDAL would ignore it."""
+    known = {driver.lower() for driver in drivers}
+    for name in names:
+        allowed = "a driver of GDAL by its short name, such as BAG, of those that rasterio was built with"
+        require(name.lower() in known, "gdal_drivers", name, allowed)
 
 
 def _opened(name: str, drivers: tuple[str, ...]) -> tuple[Any, bool]:
