@@ -42,6 +42,9 @@ def test_a_preset_that_comes_with_travjax_is_named(tmp_path):
     (tmp_path / "tiny.toml").write_text(TOML)
     with pytest.raises(InputError, match="^model = 'field': must be resnet50, as .*tiny.toml says$"):
         run_from_preset(tmp_path / "tiny.toml", model="field")
+    assert run_from_preset(PRESET, model="resnet50", actions=None).preset == PRESET
+    with pytest.raises(InputError, match="^model = 'field': must be resnet50, as the preset says$"):
+        run_from_preset(PRESET, model="field")
 
 
 def test_a_run_goes_on_only_where_it_is_told_to(trained, tmp_path, capsys):

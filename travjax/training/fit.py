@@ -44,14 +44,17 @@ def run_from_preset(
     """Returns the run of a preset, with any settings that are to differ from it.
 
     preset:  a preset, its TOML file, or the name of one that comes with travjax, such as "laptop"
-    model:   "resnet50" or "field", whose preset a name is; the ResNet's unless given
+    model:   "resnet50" or "field", whose preset a name is, the ResNet's unless given; any other preset must be of it
     robot, actions, size, spacing, contact, turn: as `Setup.load` takes them; the preset's robot unless given
     weights: file of the trunk's first weights, or "none"
     seed:    seed of the data set and of training
-    Raises InputError when there is no preset of that name, when a file is missing or wrong, when robot, action space
-    and map do not fit together, and for a seed out of range.
+    Raises InputError when there is no preset of that name, when a file is missing or wrong, when preset and model, or
+    robot, action space and map, do not fit together, and for a seed out of range.
     """
-    preset = preset if isinstance(preset, Preset) else load_preset(preset, model)
+    if isinstance(preset, Preset):
+        require(model in (None, preset.model), "model", model, f"{preset.model}, as the preset says")
+    else:
+        preset = load_preset(preset, model)
     if weights:
         preset = replace(preset, weights=weights)
     if seed is not None:
