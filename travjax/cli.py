@@ -26,7 +26,8 @@ COMMANDS = (terrain, label, map, plan, dataset, weights, train, evaluate, export
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 2 for bad input, 1 where `plan` finds no path."""
+    """Runs one command; returns the exit code: 2 for bad input, 1 where `plan` finds no path or a
+    robot's model fails the check of `physics`."""
 
     def work() -> int | None:
         arguments = _parser().parse_args(argv)

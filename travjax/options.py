@@ -175,7 +175,7 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         "--classes",
         type=_codes,
         metavar="C,C",
-        help="classes of LAS points that are ground, as in 2,9 (2 where the file has it beside others, else all)",
+        help="classes of LAS points that are ground, as in 2,9 (2, 8 and 11 where the file has 2, else all but noise)",
     )
     parser.add_argument("--up", choices=AXES_UP, help="axis of a point cloud or mesh that points up (z)")
     parser.add_argument(

@@ -15,7 +15,7 @@ def add(commands: options.Commands) -> None:
     parser = commands.add_parser(
         "train",
         help="train the estimator",
-        description="Makes or reads a data set, trains the heads on the frozen trunk, then everything, and keeps "
+        description="Makes or reads a data set, trains on it, of the ResNet50 first the heads, and keeps "
         "checkpoints, metrics.jsonl, TensorBoard files and a figure in one folder.",
     )
     parser.add_argument(

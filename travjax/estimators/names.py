@@ -13,7 +13,7 @@ class Entry:
 
     kind:   "module:class" of its EstimatorKind (kind.py); it is imported at first use, so that a command can list
             the names without Flax
-    folder: name of the folder of its runs under runs/, and of its presets in presets/
+    folder: name of the folder of its runs under runs/
     """
 
     kind: str
