@@ -51,6 +51,25 @@ def test_a_graph_that_computes_something_else_is_not_written(monkeypatch, tmp_pa
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("wrong", "error"), [(0.01, 0.01), (np.nan, np.nan)])
+@pytest.mark.parametrize("result", onnx_graph.NAMES)
+def test_the_error_of_a_graph_is_the_largest_of_all_its_results(monkeypatch, result, wrong, error):
+    predictor = Predictor(RUN, estimator())
+
+    class Session:
+        def __init__(self, graph, providers):
+            pass
+
+        def run(self, names, inputs):
+            found = predictor.predict(inputs["heights"])
+            results = {"margin": np.array(found.margins), "probability": np.array(found.probability)}
+            results[result][2, 5, 1] += wrong
+            return [results[name] for name in names]
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", Session)
+    np.testing.assert_allclose(onnx_graph.largest_error(b"", predictor), error, rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("missing", "needed"),
     [("onnx_ir", 'pip install "travjax[onnx]"'), ("jax2onnx", f"pip install --no-deps {EXPORTER}")],

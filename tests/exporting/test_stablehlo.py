@@ -14,7 +14,9 @@ from tests.field_runs import RUN, estimator
 from tests.small_training import SETUP, dataset
 from tests.small_training import run_of as resnet_run
 from travjax.config import InputError
+from travjax.exporting import exported_file
 from travjax.exporting.stablehlo import PLATFORMS, export_field, export_simulator
+from travjax.files import sha256
 from travjax.runs.predictor import Predictor
 from travjax.simulation.actions import ActionSpace
 from travjax.simulation.contact import Contact
@@ -113,6 +115,19 @@ def test_a_file_of_travjax_is_replaced_and_no_other(tmp_path):
     Path(f"{tmp_path}/other.stablehlo.json").write_text("{}")
     with pytest.raises(InputError, match="is in the way, and no description of travjax"):
         export_simulator(tmp_path / "other.stablehlo", SETUP)
+
+
+def test_a_disk_that_is_full_leaves_no_file_without_its_description(monkeypatch, tmp_path):
+    def full(path, text):
+        raise InputError(f"{path}: No space left on device")
+
+    to = tmp_path / "it.stablehlo"
+    with monkeypatch.context() as patch, pytest.raises(InputError, match="it.stablehlo.json: No space left"):
+        patch.setattr(exported_file, "save_text", full)
+        export_simulator(to, SETUP)
+    assert not any(tmp_path.iterdir())
+    export_simulator(to, SETUP)
+    assert described(to)["sha256"] == sha256(to)
 
 
 def test_an_estimator_of_single_trajectories_is_refused(tmp_path):

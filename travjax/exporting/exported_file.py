@@ -25,20 +25,21 @@ def write(to: Path, data: bytes, setup: Setup, source: str, outputs: dict[str, s
     outputs: what its results are, by name
     Raises InputError when one of them cannot be written.
     """
+    rows, cols = setup.grid.shape
     with atomic_write(to) as temporary:
         temporary.write_bytes(data)
-    rows, cols = setup.grid.shape
-    described = setup.to_json_text(
-        function=source,
-        inputs={"heights": f"[b, {rows}, {cols}] float32 metres, NaN unknown"},
-        outputs=outputs,
-        events=setup.robot.event_names,
-        limits=setup.robot.limits,
-        trajectories=len(setup.actions),
-        jax=jax.__version__,
-        sha256=sha256(to),
-    )
-    return to, save_text(_beside(to), f"{described}\n")
+        described = setup.to_json_text(
+            function=source,
+            inputs={"heights": f"[b, {rows}, {cols}] float32 metres, NaN unknown"},
+            outputs=outputs,
+            events=setup.robot.event_names,
+            limits=setup.robot.limits,
+            trajectories=len(setup.actions),
+            jax=jax.__version__,
+            sha256=sha256(temporary),
+        )
+        description = save_text(_beside(to), f"{described}\n")  # first: a file without it would count as another's
+    return to, description
 
 
 def _beside(to: Path) -> Path:

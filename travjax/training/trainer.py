@@ -117,7 +117,8 @@ class Trainer:
         }
         if self._features_file is None:
             return compute()
-        return kept(self._features_file, origin_of(self.data.dataset.fingerprint, self._variables, samples), compute)
+        origin = origin_of(self.run, self.data.dataset.fingerprint, self._variables, samples)
+        return kept(self._features_file, origin, compute)
 
     @usual_flags()
     def start(self, estimator: Network) -> None:

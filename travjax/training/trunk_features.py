@@ -8,9 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from travjax import progress
+from travjax.config import InputError
 from travjax.data.sampling import Samples
 from travjax.files import save_npz
 from travjax.models.variables import Variables
+from travjax.runs.run import Run
 
 Features = Mapping[str, Float[np.ndarray, "k f"]]
 """The features of samples, by the names of the samples."""
@@ -19,10 +22,15 @@ ORIGIN = "origin"
 """Name in the file of what its features were computed from."""
 
 
-def origin_of(fingerprint: str, variables: Variables, samples: Mapping[str, Samples]) -> str:
-    """Returns a digest of what features depend on: the data set, the trunk and the samples."""
+OF = "of "
+"""What the names of samples begin with in the file, so that none is the origin's."""
+
+
+def origin_of(run: Run, fingerprint: str, variables: Variables, samples: Mapping[str, Samples]) -> str:
+    """Returns a digest of what features depend on: robot and grid, images, the data set, the trunk and the samples."""
     trunk = jax.device_get((variables["trunk"], variables["statistics"]))
-    digest = sha256(fingerprint.encode())
+    settings = run.setup.to_json_text(), run.preset.trunk, run.preset.elevation_scale, fingerprint
+    digest = sha256(repr(settings).encode())
     for name, part in samples.items():
         digest.update(name.encode())
         for index in part:
@@ -33,19 +41,26 @@ def origin_of(fingerprint: str, variables: Variables, samples: Mapping[str, Samp
 
 
 def kept(path: Path, origin: str, compute: Callable[[], Features]) -> Features:
-    """Returns the features in a file, computed and written anew where it is missing, damaged or of another origin."""
-    found = _read(path)
-    if str(found.pop(ORIGIN, None)) == origin:
+    """Returns the features in a file, computed and written anew where it is missing, damaged or of another origin.
+
+    Those that cannot be written are returned all the same, and a line says so.
+    """
+    if (found := _read(path, origin)) is not None:
         return found
     features = compute()
-    save_npz(path, **{ORIGIN: origin}, **features)
+    try:
+        save_npz(path, **{ORIGIN: origin}, **{OF + name: array for name, array in features.items()})
+    except InputError as error:
+        progress.say(f"{error}; features of the frozen trunk are kept in memory alone")
     return features
 
 
-def _read(path: Path) -> dict[str, np.ndarray]:
-    """Reads the arrays of a file; none where it is missing or damaged."""
+def _read(path: Path, origin: str) -> Features | None:
+    """Reads the features in a file; None where it is missing, damaged or of another origin."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return dict(file)
+            if str(file[ORIGIN]) == origin:
+                return {name.removeprefix(OF): file[name] for name in file.files if name.startswith(OF)}
     except Exception:  # NumPy and zipfile raise many kinds of errors for a damaged file
-        return {}
+        pass
+    return None
