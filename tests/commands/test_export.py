@@ -88,13 +88,19 @@ def test_the_card_says_what_it_was_trained_on(field, tmp_path):
     assert "not evaluated: `travjax evaluate` writes the tables" in said
 
 
-def test_the_card_holds_the_tables_of_the_evaluation(field, tmp_path):
+def test_the_card_holds_the_tables_of_the_evaluation_of_the_same_step(field, tmp_path):
     folder = copy(field, tmp_path / "run")
-    (folder / "evaluation").mkdir()
-    (folder / "evaluation/tables.txt").write_text("F1 of everything\n0.5\n")
-    exported(folder, tmp_path / "it.safetensors")
+    best, last = (load_meta(field / "checkpoints", which)["position"]["total"] for which in ("best", "latest"))
+    for name, step, f1 in (("evaluation", best - 1, 0.4), ("evaluation_latest", last, 0.5)):
+        (folder / name).mkdir()
+        (folder / name / "tables.txt").write_text(f"F1 of everything\n{f1}\n")
+        (folder / name / "evaluation.json").write_text(json.dumps({"sample": {"steps": step}}))
+    exported(folder, tmp_path / "it.safetensors", "--checkpoint", "latest")
     said = (tmp_path / "it.md").read_text()
     assert "```\nF1 of everything\n0.5\n```" in said and "not evaluated" not in said
+    (folder / "evaluation_latest/evaluation.json").write_text('{"sample": {"steps": 3}}')
+    exported(folder, tmp_path / "it.safetensors")
+    assert "not evaluated: " in (tmp_path / "it.md").read_text()
 
 
 def test_the_card_of_a_hazard_field_holds_what_was_measured_on_real_ground(field, tmp_path):

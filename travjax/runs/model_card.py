@@ -5,7 +5,7 @@ from pathlib import Path
 import jax
 from safetensors import SafetensorError, safe_open
 
-from travjax.config import InputError, read_text
+from travjax.config import InputError, read_json, read_text
 from travjax.files import first_lines, require_replaceable, save_text, user_path
 from travjax.runs.model_file import SUFFIX, write_model
 from travjax.runs.run import Run, load_estimator
@@ -31,9 +31,9 @@ def export_run(folder: str | Path, to: str | Path, checkpoint: str = "best") -> 
     trained, network, meta = load_estimator(run, checkpoint)
     position = meta["position"]
     notes = {"dataset": meta["dataset"], "epoch": position["epoch"], "step": position["total"]}
+    text = card(trained, notes, path.name, _tables(run, position["total"]), _text(run / "comparison/sites.txt"))
     write_model(path, trained, network, notes)
-    tables, real = (_text(run / name) for name in ("evaluation/tables.txt", "comparison/sites.txt"))
-    return path, save_text(beside, card(trained, notes, path.name, tables, real))
+    return path, save_text(beside, text)
 
 
 def _is_model(path: Path) -> bool:
@@ -48,6 +48,16 @@ def _is_model(path: Path) -> bool:
 def _is_card(path: Path) -> bool:
     """Tells whether a file is a model card."""
     return PURPOSE in first_lines(path, 3)
+
+
+def _tables(run: Path, step: int) -> str | None:
+    """Returns the tables of an evaluation of a run's checkpoint of a step; None where there is none."""
+    for path in sorted(run.glob("evaluation*/evaluation.json")):
+        found = read_json(path)
+        sample = found.get("sample") if isinstance(found, dict) else None
+        if isinstance(sample, dict) and sample.get("steps") == step:
+            return _text(path.with_name("tables.txt"))
+    return None
 
 
 def _text(path: Path) -> str | None:
