@@ -55,6 +55,8 @@ def test_a_run_goes_on_only_where_it_is_told_to(trained, tmp_path, capsys):
     with pytest.raises(InputError, match=f"^the run {folder}: preset.heads.hidden = 8: must be 16"):
         other = replace(run, preset=replace(PRESET, heads=replace(PRESET.heads, hidden=8)))
         fit(other, folder, data=trained.parent / "set", resume=True, option="the run")
-    fit(run, str(folder), data=str(trained.parent / "set"), resume=True)
+    other = replace(run, preset=replace(PRESET, weights="other.npz"))
+    fit(other, str(folder), data=str(trained.parent / "set"), resume=True)
+    assert Run.load(folder) == run  # it began with those weights
     assert rows_of(folder) == rows_of(trained) and files(folder / "checkpoints") == before
     assert capsys.readouterr().out.endswith(f"\n{folder}/training.png\n")

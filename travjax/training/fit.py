@@ -101,10 +101,11 @@ def _fit(
     until: float,
 ) -> bool:
     """Trains a run in a folder that no other process uses; returns whether all epochs are trained."""
-    preset = wanted.preset
     resumes = has_checkpoints(folder)
     if resumes:
         _check_folder(folder, wanted, resume, option)
+        wanted = replace(wanted, preset=replace(wanted.preset, weights=Run.load(folder).preset.weights))
+    preset = wanted.preset
     devices.wait()
     file = None if resumes else find_weights(preset.weights)
     weights = load_weights(file, preset.trunk) if file else None
