@@ -14,11 +14,13 @@ import pytest
 
 from tests.conftest import SETUPS
 from tests.small_training import loads, run_of
-from travjax.config import load_toml
+from travjax.config import InputError, load_toml
 from travjax.data.provenance import SitesConfig
 from travjax.estimators.preset import Preset
+from travjax.evaluation.simulator_benchmark import machine
+from travjax.evaluation.tables import rows_table
 from travjax.experiments.gpu import __main__ as gpu
-from travjax.experiments.gpu import kernels
+from travjax.experiments.gpu import kernels, parts
 from travjax.experiments.gpu.config import PARTS, GpuConfig, Plan
 from travjax.experiments.gpu.estimate import estimate
 from travjax.experiments.gpu.kernels import Kernels, Measured, labelling_work
@@ -102,7 +104,7 @@ def test_everything_small_lies_in_the_folder(rehearsed):
     found = {
         str(path.relative_to(out)) for path in out.rglob("*") if path.is_file() and out / "work" not in path.parents
     }
-    assert {"report.md", "summary.json", "bench.tsv", "field.safetensors", "field.md"} <= found
+    assert {"report.md", "summary.json", "config.json", "bench.tsv", "field.safetensors", "field.md"} <= found
     for name in ("field", "resnet50"):
         assert {f"{name}/{file}" for file in ("tables.txt", "evaluation.json", "metrics.jsonl", "run.json")} <= found
     assert {"transfer/report.md", "transfer/results.json", "transfer/f1.png"} <= found
@@ -122,6 +124,7 @@ def test_the_report_says_how_far_each_part_is_and_what_was_measured(rehearsed):
         assert any(one.startswith(what) for one in whats) and what in report
     assert all(row["limited_by"] == "unknown" and row["share"] is None for row in rows)  # a CPU
     assert (out / "resnet50/tables.txt").read_text().strip() in report
+    assert "## Transfer\n\n[Report](transfer/report.md)\n" in report
 
 
 def test_what_the_device_refuses_is_said_and_left_out(monkeypatch, capsys):
@@ -132,11 +135,100 @@ def test_what_the_device_refuses_is_said_and_left_out(monkeypatch, capsys):
     done = lambda: Measured(0.5, 1.0, Work(1, {"float32": 1}))
     listed = [("large maps", 9, refused), ("small maps", 1, done), ("maps", 4, done), ("kept maps", 2, refused)]
     monkeypatch.setattr(Kernels, "measurements", lambda kernels: listed)
-    kept = {"what": "kept maps", "at_once": 2}
-    rows = list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], float("inf")))
-    assert [row["what"] for row in rows] == ["small maps", "maps", "kept maps"] and rows[-1] == kept
+    kept = {"what": "kept maps", "at_once": 2, "repeats": plan.config.repeats, "machine": machine()}
+    measured = list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], float("inf")))
+    assert [len(rows) for rows in measured] == [1, 2, 3, 4] and measured[0] == [kept]
+    rows = measured[-1]
+    assert [row["what"] for row in rows] == ["large maps", "small maps", "maps", "kept maps"] and rows[-1] == kept
+    assert rows[0]["limited_by"] == kernels.REFUSED and rows[0]["ms"] is None
+    assert rows_table(rows[:3], kernels.COLUMNS).count(kernels.REFUSED) == 1
     assert capsys.readouterr().out.startswith("large maps, 9 at once: left out: RESOURCE_EXHAUSTED")
-    assert list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], -1.0)) == [kept]
+    assert list(Kernels(plan.config, plan.runs["resnet50"]).rows([kept], -1.0)) == [[kept]]
+    assert list(Kernels(plan.config, plan.runs["resnet50"]).rows(rows, float("inf"))) == [rows]
+
+
+@pytest.mark.parametrize("changed", [{"machine": "cpu of another"}, {"repeats": 99}])
+def test_rows_of_another_machine_or_of_other_repeats_are_measured_again(monkeypatch, changed):
+    plan = Plan.load(find_preset("smoke", "gpu"), "none")
+    listed = [("maps", 4, lambda: Measured(0.5, 1.0, Work(1, {"float32": 1})))]
+    monkeypatch.setattr(Kernels, "measurements", lambda measured: listed)
+    row = listed[0][2]().row("maps", 4, plan.config.repeats)
+    of = lambda kept: list(Kernels(plan.config, plan.runs["resnet50"]).rows(kept, float("inf")))
+    assert of([row]) == [[row]]
+    assert of([row | changed]) == [[], [row]]
+
+
+# ---- Calls that go on
+
+
+def session_of(folder: Path, **settings) -> parts.Session:
+    """A session of the smoke preset, with some of its settings changed."""
+    plan = Plan.load(find_preset("smoke", "gpu"), "none")
+    return parts.Session.load(replace(plan, config=replace(plan.config, **settings)), folder)
+
+
+def test_a_folder_is_that_of_one_preset(tmp_path):
+    session_of(tmp_path).note("bench", {"finished": True, "rows": []})
+    assert session_of(tmp_path).is_finished("bench")
+    with pytest.raises(InputError, match=f"^--out {tmp_path}: holds results of another preset; allowed: another"):
+        session_of(tmp_path, field_epochs=1)
+    (tmp_path / "summary.json").write_text('{"bench": 3}')
+    with pytest.raises(InputError, match="summary.json = .*: must be results by part; remove it to begin anew"):
+        session_of(tmp_path)
+
+
+def test_a_benchmark_is_finished_for_its_machine_only(tmp_path):
+    session = session_of(tmp_path)
+    for name, finished in ((machine(), True), ("cpu of another", False)):
+        session.note("bench", {"finished": True, "rows": [{"machine": name}]})
+        assert session.is_finished("bench") == finished
+
+
+def test_rows_are_kept_as_they_are_measured(tmp_path, monkeypatch):
+    def killed():
+        raise KeyboardInterrupt
+
+    done = lambda: Measured(0.5, 1.0, Work(1, {"float32": 1}))
+    monkeypatch.setattr(Kernels, "measurements", lambda measured: [("maps", 4, done), ("more maps", 8, killed)])
+    with pytest.raises(KeyboardInterrupt):
+        session_of(tmp_path).bench({}, float("inf"))
+    result = session_of(tmp_path).results["bench"]
+    assert not result["finished"] and [row["what"] for row in result["rows"]] == ["maps"]
+    assert len((tmp_path / "bench.tsv").read_text().splitlines()) == 2
+
+
+def test_a_transfer_is_from_one_state_of_the_resnet50(tmp_path, monkeypatch, capsys):
+    begun = tmp_path / "work/transfer/runs/imagenet_0"
+
+    def experiment(path, folder, base_of, synthetic, stand_ins, until):
+        found.append(begun.exists())
+        begun.mkdir(parents=True, exist_ok=True)
+        return True
+
+    found, steps = [], iter([7, 7, 7, 9, 9])
+    monkeypatch.setattr(parts, "_best_step", lambda folder: next(steps))
+    monkeypatch.setattr(parts.transfer, "experiment", experiment)
+    session = session_of(tmp_path)
+    for _ in range(2):
+        session.note("transfer", session.transfer(session.results.get("transfer", {}), float("inf")))
+    assert session.is_finished("transfer")  # with 7 steps
+    assert not session.is_finished("transfer")  # with 9
+    assert session.transfer(session.results["transfer"], float("inf")) == {"finished": True, "synthetic_steps": 9}
+    assert found == [False, True, False]
+    assert "from 9 steps of the ResNet50, not 7: begins anew" in capsys.readouterr().out
+
+
+def test_what_failed_in_an_earlier_call_is_no_failure_of_this_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(parts.Session, "bench", lambda session, before, until: {"finished": True, "rows": []})
+    assert gpu.main(["smoke", "--parts", "transfer", "--out", str(tmp_path)]) == 2
+    assert gpu.main(["smoke", "--parts", "bench", "--out", str(tmp_path)]) == 0
+
+
+def test_a_preset_of_another_estimator_is_refused():
+    plan = Plan.load(find_preset("smoke", "gpu"), "none")
+    wrong = replace(plan, config=replace(plan.config, field=plan.config.resnet50))
+    with pytest.raises(InputError, match="^model = 'field': must be resnet50, as .* says$"):
+        wrong.to_json()
 
 
 # ---- What work takes at least
@@ -150,11 +242,12 @@ def test_the_larger_of_two_times_is_the_limit():
 
 
 def test_a_row_has_its_share_of_the_limit_on_a_known_device(monkeypatch):
-    device = type("Device", (), {"device_kind": "NVIDIA H200"})
+    device = type("Device", (), {"device_kind": "NVIDIA H200", "platform": "gpu"})
     monkeypatch.setattr(kernels.jax, "devices", lambda: [device])
     row = Measured(0.02, 1.0, Work(4.8e9, {"float32": 1.0}), poses=50).row("maps", 10, 3)
     assert (row["us_each"], row["per_s"], row["poses_per_s"]) == (2000.0, 500.0, 25_000.0)
     assert (row["limit_us"], row["share"], row["limited_by"]) == (pytest.approx(1000), pytest.approx(0.5), "memory")
+    assert row["machine"].startswith("gpu NVIDIA H200, ")
 
 
 @pytest.mark.parametrize("name", ["paper", "coarse small map"])

@@ -5,7 +5,6 @@ is not finished goes on with the same command. All that is small lies in the fol
 """
 
 import argparse
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import jax
 
 from travjax import progress
-from travjax.config import InputError, one_line, read_json, require, require_number
+from travjax.config import InputError, one_line, require_number
 from travjax.estimators.names import FIELD, RESNET
 from travjax.estimators.preset import find_weights
 from travjax.evaluation.simulator_benchmark import machine
@@ -23,8 +22,8 @@ from travjax.experiments.gpu import estimate
 from travjax.experiments.gpu.config import BENCH, PARTS, TRANSFER, Plan
 from travjax.experiments.gpu.kernels import COLUMNS
 from travjax.experiments.gpu.limits import FORMULA
-from travjax.experiments.gpu.parts import WORK, Result, Session, tables
-from travjax.files import find_preset, held, output_folder, save_text, user_path
+from travjax.experiments.gpu.parts import RESULTS, WORK, Result, Session, tables
+from travjax.files import find_preset, held, output_folder, user_path
 from travjax.signals import going_on
 
 DESCRIPTION = (
@@ -34,8 +33,6 @@ DESCRIPTION = (
 
 SECONDS = 840
 """A quarter of an hour, less a minute for what comes before and after."""
-
-RESULTS = "summary.json"
 
 TITLES = {BENCH: "Kernels", FIELD: "Hazard field", RESNET: "ResNet50", TRANSFER: "Transfer"}
 
@@ -70,30 +67,29 @@ def run(arguments: argparse.Namespace) -> None:
         find_weights(plan.runs[RESNET].preset.weights)  # before minutes of work
     out = arguments.out or Path("runs/gpu") / plan.path.stem
     with held(out), going_on(launch.GOES_ON):
-        _run(Session(plan, output_folder(out)), arguments.parts, end)
+        _run(Session.load(plan, output_folder(out)), arguments.parts, end)
 
 
 def _run(session: Session, parts: Sequence[str], end: float) -> None:
     """Runs parts until the end, a failure of one of them aside, and reports."""
     out, shares = session.out, dict(zip(PARTS, session.plan.config.shares, strict=True))
-    results: dict[str, Result] = read_json(out / RESULTS) if (out / RESULTS).exists() else {}
-    require(isinstance(results, dict), f"{out / RESULTS}", results, "results by part; remove it to begin anew")
+    failed = []
+    progress.say(machine())
     for name in PARTS:
-        before, began = results.get(name, {}), time.monotonic()
-        if name not in parts or before.get("finished") or began >= end:
+        began = time.monotonic()
+        if name not in parts or session.is_finished(name) or began >= end:
             continue
+        before = {key: value for key, value in session.results.get(name, {}).items() if key != "failed"}
         progress.say(f"\n{TITLES[name]}, {shares[name] * (end - began):.0f} s")
         try:
             result = session.part(name)(before, began + shares[name] * (end - began))
         except (InputError, jax.errors.JaxRuntimeError, MemoryError) as error:
-            result = before | {"finished": False, "failed": one_line(error)}
-        else:
-            result.pop("failed", None)
-        results[name] = result | {"seconds": before.get("seconds", 0) + time.monotonic() - began}
-        save_text(out / RESULTS, json.dumps(results, indent=1, allow_nan=False) + "\n")
-        _report(session, results)
-    progress.wrote(out / "report.md", out / RESULTS)
-    failed = [f"{name}: {results[name]['failed']}" for name in parts if "failed" in results.get(name, {})]
+            said = one_line(error) or "out of memory"
+            failed.append(f"{name}: {said}")
+            result = session.results.get(name, before) | {"finished": False, "failed": said}
+        session.note(name, result | {"seconds": before.get("seconds", 0) + time.monotonic() - began})
+        _report(session, session.results)
+    progress.wrote(*(path for path in (out / "report.md", out / RESULTS) if path.exists()))
     if failed:
         raise InputError("; ".join(failed))
 
@@ -106,7 +102,7 @@ def _report(session: Session, results: dict[str, Result]) -> None:
         pieces += [f"## {TITLES[BENCH]}", launch.verbatim(rows_table(rows, COLUMNS)), f"{FORMULA}."]
     for name in PARTS:
         if text := tables(session.out, name):
-            pieces += [f"## {TITLES[name]}", launch.verbatim(text)]
+            pieces += [f"## {TITLES[name]}", text]
     pieces.append(f"Checkpoints are in `{WORK}`.")
     launch.write_report(session.out, "On a GPU", pieces)
 

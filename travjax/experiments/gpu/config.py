@@ -4,8 +4,9 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
-from travjax.config import load_toml, require, require_number
+from travjax.config import load_toml, require, require_number, to_json
 from travjax.estimators.names import FIELD, RESNET
 from travjax.estimators.preset import MOST
 from travjax.files import user_path
@@ -92,8 +93,13 @@ class Plan:
         config = self.config
         actions = self.file(config.actions) if config.actions else None
         run_of = partial(run_from_preset, actions=actions, size=config.size, spacing=config.spacing)
-        field = run_of(self.file(config.field))
+        field = run_of(self.file(config.field), model=FIELD)
         if config.field_epochs:
             training = replace(field.preset.training, epochs=config.field_epochs)
             field = replace(field, preset=replace(field.preset, training=training))
-        return {FIELD: field, RESNET: run_of(self.file(config.resnet50), weights=self.weights)}
+        return {FIELD: field, RESNET: run_of(self.file(config.resnet50), model=RESNET, weights=self.weights)}
+
+    def to_json(self) -> dict[str, Any]:
+        """Converts what results depend on to what JSON can hold: the preset and its runs but for first weights."""
+        runs = {name: replace(run, preset=replace(run.preset, weights="none")) for name, run in self.runs.items()}
+        return {"config": to_json(self.config)} | {name: run.to_json() for name, run in runs.items()}

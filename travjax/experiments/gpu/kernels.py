@@ -20,7 +20,7 @@ import numpy as np
 
 from travjax import progress
 from travjax.config import one_line
-from travjax.evaluation.simulator_benchmark import median_time, mixed_maps, terrain_row
+from travjax.evaluation.simulator_benchmark import machine, median_time, mixed_maps, terrain_row
 from travjax.experiments.gpu.config import GpuConfig
 from travjax.experiments.gpu.limits import DEVICES, Work
 from travjax.experiments.gpu.programs import prediction, read_program, training_step
@@ -55,6 +55,9 @@ OPERATIONS = 6
 NOISE = 260
 """Operations for a height: three noises of five vertices, 16 for each vertex, and 20 to mix them."""
 
+REFUSED = "refused"
+"""Stands in place of a limit where the device refused to compute."""
+
 SITE = 2048
 """Cells along an edge of the site that a tile is part of: 128 m at the paper's spacing."""
 
@@ -87,7 +90,14 @@ class Measured:
             "limited_by": by,
             "first_call_s": self.first,
             "repeats": repeats,
+            "machine": machine(),
         }
+
+
+def refused(what: str, at_once: int, repeats: int) -> dict:
+    """Returns the row of what the device refuses, without figures."""
+    row = {"what": what, "at_once": at_once, "repeats": repeats, "limited_by": REFUSED, "machine": machine()}
+    return dict.fromkeys(COLUMNS) | row
 
 
 @dataclass(frozen=True)
@@ -97,23 +107,27 @@ class Kernels:
     config: GpuConfig
     run: Run
 
-    def rows(self, kept: list[dict], until: float) -> Iterator[dict]:
-        """Yields the rows in order of worth: those that are kept, and others while it is not later than `until`.
+    def rows(self, kept: list[dict], until: float) -> Iterator[list[dict]]:
+        """Yields all rows in order of worth, with one more each time, while it is not later than `until`.
 
+        kept:  rows of earlier calls, of which those of this machine and of as many repeats are not measured again
         until: of `time.monotonic()`
-        What the device refuses, for want of memory for one, is said and left out.
+        What the device refuses, for want of memory for one, is said and has a row without figures.
         """
-        there = {(row["what"], row["at_once"]): row for row in kept}
-        for what, at_once, measure in self.measurements():
-            if row := there.get((what, at_once)):
-                yield row
-            elif time.monotonic() < until:
-                try:
-                    measured = measure()
-                except jax.errors.JaxRuntimeError as error:
-                    progress.say(f"{what}, {at_once} at once: left out: {one_line(error)}")
-                else:
-                    yield measured.row(what, at_once, self.config.repeats)
+        here, wanted = machine(), self.measurements()
+        of_here = [row for row in kept if (row.get("machine"), row["repeats"]) == (here, self.config.repeats)]
+        there = {(row["what"], row["at_once"]): row for row in of_here}
+        ordered = lambda: [there[what, at_once] for what, at_once, _ in wanted if (what, at_once) in there]
+        yield ordered()
+        for what, at_once, measure in wanted:
+            if (what, at_once) in there or time.monotonic() >= until:
+                continue
+            try:
+                there[what, at_once] = measure().row(what, at_once, self.config.repeats)
+            except (jax.errors.JaxRuntimeError, MemoryError) as error:
+                progress.say(f"{what}, {at_once} at once: left out: {one_line(error) or 'out of memory'}")
+                there[what, at_once] = refused(what, at_once, self.config.repeats)
+            yield ordered()
 
     def measurements(self) -> list[tuple[str, int, Callable[[], Measured]]]:
         """Lists what is measured: a text, how many at once, and a function; one size of each comes first."""
