@@ -62,7 +62,7 @@ train: setup
 	$(BIN)/travjax train $(PRESET) --model $(MODEL) $(if $(WEIGHTS),--weights $(WEIGHTS)) --resume --out $(RUN)
 	$(BIN)/travjax evaluate $(RUN)
 	@echo
-	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=workstation (3 hours), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
+	@echo "Other presets: make train PRESET=smoke (3 minutes), PRESET=laptop (45 minutes), PRESET=workstation (2 hours), PRESET=paper EXTRAS=dev,cuda (a GPU; make clean before)."
 	@echo "The hazard field: make train MODEL=field PRESET=smoke (1 minute), PRESET=laptop (an hour); it needs no ImageNet weights."
 	@echo "Another robot: $(BIN)/travjax train $(PRESET) --model $(MODEL) --robot husky_a200 --out DIR"
 

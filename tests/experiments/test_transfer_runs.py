@@ -29,6 +29,7 @@ from travjax.experiments.transfer_runs import (
 )
 from travjax.runs.evaluator import Evaluator
 from travjax.runs.run import Run
+from travjax.simulation.events import UNKNOWN_LABEL
 from travjax.simulation.robot import Robot
 
 pytestmark = pytest.mark.usefixtures("shared_code")
@@ -222,6 +223,14 @@ def test_a_data_set_for_another_robot_is_refused_with_both_named(trained, real, 
 def test_a_data_set_without_held_out_windows_is_refused(trained, real, tmp_path):
     message = refusal(FROZEN, Run.load(trained), trained, replace(real, split=real.split * 0), tmp_path, Devices.all())
     assert message.startswith("held-out windows = 0")
+
+
+def test_held_out_sites_have_known_trajectories_and_names_of_their_own(trained, real, tmp_path):
+    unknown = replace(real, labels=np.full_like(real.labels, UNKNOWN_LABEL))
+    renamed = replace(real, group=np.full_like(real.group, "validation", dtype="<U10"))
+    said = [refusal(FROZEN, Run.load(trained), trained, data, tmp_path, Devices.all()) for data in (unknown, renamed)]
+    assert said[0].startswith("held-out site ") and said[0].endswith(": known trajectories = 0: must be at least one")
+    assert said[1] == "held-out site = 'validation': must be of another name"
 
 
 def test_a_site_to_show_that_is_not_held_out_is_refused_with_those_that_are(trained, real, tmp_path):

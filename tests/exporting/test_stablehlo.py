@@ -67,6 +67,12 @@ def test_a_field_predicts_as_its_predictor_does(function, heights):
     assert some[0] == 1 and 0 < some[1] < 1 and some[2] == 0
 
 
+def test_a_map_alone_has_the_results_it_has_among_others(function, heights):
+    among = function(heights)
+    for name, array in function(heights[1:2]).items():
+        np.testing.assert_allclose(array[0], among[name][1], rtol=0, atol=1e-6)
+
+
 def test_what_is_no_height_is_unknown(function, heights):
     marked = np.where(np.isnan(heights), np.float32(-9999), heights)
     marked[2, 14, 14:18] = np.inf, -np.inf, 1e6, -32768

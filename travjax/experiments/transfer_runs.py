@@ -199,13 +199,17 @@ def _name(arm: str) -> str:
 
 
 def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
-    """Returns samples of the test maps of each site."""
+    """Returns samples of the test maps of each site, by its name beside "training" and "validation"."""
     test = dataset.maps_of("test")
     require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
     sites = list(dict.fromkeys(dataset.group[test].tolist()))
     each, seed = config.trajectories_per_map or len(dataset.actions), config.training.sampling_seed
     of = lambda site: natural_sample(dataset.labels, test[dataset.group[test] == site], seed, len(test), each)
-    return {site: of(site) for site in sites}
+    held_out = {site: of(site) for site in sites}
+    for site, samples in held_out.items():
+        require(site not in ("training", "validation"), "held-out site", site, "of another name")
+        require(len(samples[0]) > 0, f"held-out site {site}: known trajectories", 0, "at least one")
+    return held_out
 
 
 def run_all(
