@@ -7,7 +7,7 @@ and a file beside the raster that GDAL would open by itself is looked at first.
 import os
 import re
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -55,8 +55,8 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
     _require_closed(path)
     if not str(path).isprintable() and any("\ud800" <= letter <= "\udfff" for letter in str(path)):
         raise InputError("name: must be UTF-8, which GDAL wants; rename the file")
-    with _gdal() as drivers:
-        _require_known(options.gdal_drivers, drivers)
+    with _gdal() as gdal:
+        _require_known(options.gdal_drivers, gdal)
         file, placed = _opened(str(path.absolute()), (*DRIVERS, *options.gdal_drivers))
         if not file.count and file.subdatasets:
             file, placed = _variable(path, file, options.band)
@@ -85,8 +85,8 @@ def read_raster(path: Path, options: DemOptions) -> Raster:
 
 
 @contextmanager
-def _gdal() -> Iterator[Collection[str]]:
-    """Configures GDAL, and turns whatever it cannot read into one line; yields the names of its drivers."""
+def _gdal() -> Iterator[Any]:
+    """Configures GDAL, and turns whatever it cannot read into one line; yields rasterio's environment."""
     try:
         import rasterio
     except ImportError:
@@ -94,7 +94,7 @@ def _gdal() -> Iterator[Collection[str]]:
     try:
         with rasterio.Env(GDAL_CACHEMAX=CACHE_MIB, AAIGRID_DATATYPE="Float64") as gdal:
             _use_own_database()
-            yield gdal.drivers()
+            yield gdal
     except rasterio.errors.RasterioError as error:
         raise InputError(f"not a raster that can be read: {_first_line(error.__cause__ or error)}") from None
 
@@ -118,9 +118,9 @@ def _use_own_database() -> None:
         raise InputError(f"PROJ, as rasterio uses it, finds no coordinate systems with {data}: {error}") from None
 
 
-def _require_known(names: tuple[str, ...], drivers: Collection[str]) -> None:
+def _require_known(names: tuple[str, ...], gdal: Any) -> None:
     """Raises InputError for a name of no driver; GDAL would ignore it."""
-    known = {driver.lower() for driver in drivers}
+    known = {driver.lower() for driver in gdal.drivers()} if names else set()
     for name in names:
         allowed = "a driver of GDAL by its short name, such as BAG, of those that rasterio was built with"
         require(name.lower() in known, "gdal_drivers", name, allowed)
