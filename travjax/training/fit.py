@@ -103,8 +103,7 @@ def _fit(
     """Trains a run in a folder that no other process uses; returns whether all epochs are trained."""
     resumes = has_checkpoints(folder)
     if resumes:
-        _check_folder(folder, wanted, resume, option)
-        wanted = replace(wanted, preset=replace(wanted.preset, weights=Run.load(folder).preset.weights))
+        wanted = _going_on(folder, wanted, resume, option)
     preset = wanted.preset
     devices.wait()
     file = None if resumes else find_weights(preset.weights)
@@ -132,11 +131,16 @@ def _fit(
     return finished
 
 
-def _check_folder(folder: Path, wanted: Run, resume: bool, option: str) -> None:
-    """Raises InputError where a run would be overwritten, or continued with other settings."""
+def _going_on(folder: Path, wanted: Run, resume: bool, option: str) -> Run:
+    """Returns the wanted run with the first weights that the folder's run began with.
+
+    Raises InputError where that would be overwritten, or continued with other settings.
+    """
     if not resume:
         raise InputError(f"--out {folder}: holds a training run; allowed: --resume to go on with it, or another folder")
-    Run.load(folder).require_same_settings(wanted, f"{option} {folder}")
+    begun = Run.load(folder)
+    begun.require_same_settings(wanted, f"{option} {folder}")
+    return replace(wanted, preset=replace(wanted.preset, weights=begun.preset.weights))
 
 
 def _dataset(data: str | Path | Dataset | None, wanted: Run, folder: Path, devices: Devices) -> Dataset:
