@@ -88,17 +88,17 @@ def _run(session: Session, parts: Sequence[str], end: float) -> None:
             failed.append(f"{name}: {said}")
             result = session.results.get(name, before) | {"finished": False, "failed": said}
         session.note(name, result | {"seconds": before.get("seconds", 0) + time.monotonic() - began})
-        _report(session, session.results)
+        _report(session)
     progress.wrote(*(path for path in (out / "report.md", out / RESULTS) if path.exists()))
     if failed:
         raise InputError("; ".join(failed))
 
 
-def _report(session: Session, results: dict[str, Result]) -> None:
+def _report(session: Session) -> None:
     """Writes report.md: what is finished, the benchmark, and the tables of all evaluations."""
-    states = "\n".join(_state(name, results.get(name)) for name in PARTS)
+    states = "\n".join(_state(name, session.results.get(name)) for name in PARTS)
     pieces: list[launch.Piece] = [f"{machine()}; preset {session.plan.path.stem}.", states]
-    if rows := results.get(BENCH, {}).get("rows"):
+    if rows := session.results.get(BENCH, {}).get("rows"):
         pieces += [f"## {TITLES[BENCH]}", launch.verbatim(rows_table(rows, COLUMNS)), f"{FORMULA}."]
     for name in PARTS:
         if text := tables(session.out, name):

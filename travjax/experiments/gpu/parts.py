@@ -61,7 +61,7 @@ class Session:
     @staticmethod
     def load(plan: Plan, out: Path) -> "Session":
         """Goes on in a folder; raises InputError where it holds results of another preset, or something else."""
-        path, described = out / "config.json", json.loads(json.dumps(plan.to_json()))
+        path, described = out / "config.json", plan.to_json()
         if not path.exists():
             save_text(path, json.dumps(described, indent=1) + "\n")
         elif read_json(path) != described:
@@ -80,7 +80,7 @@ class Session:
     def is_finished(self, name: str) -> bool:
         """Tells whether nothing is left to do for a part, on this machine and from the ResNet50 as it is now."""
         result = self.results.get(name, {})
-        if name == BENCH and any(row.get("machine") != machine() for row in result.get("rows", [])):
+        if name == BENCH and {row.get("machine") for row in result.get("rows", [])} - {machine()}:
             return False
         if name == TRANSFER and _best_step(self.work / RESNET) not in (None, result.get("synthetic_steps")):
             return False
@@ -104,12 +104,12 @@ class Session:
     def bench(self, before: Result, until: float) -> Result:
         """Measures kernels and network; rows of earlier calls on the same machine are kept."""
         kernels = Kernels(self.plan.config, self.plan.runs[RESNET])
-        result: Result = {}
+        result, count = before, len(kernels.measurements())
         for rows in kernels.rows(before.get("rows", []), until):
-            result = {"finished": len(rows) == len(kernels.measurements()), "rows": rows}
+            result = before | {"finished": len(rows) == count, "rows": rows}
             with atomic_write(self.out / "bench.tsv") as temporary:
                 write_tsv(rows, temporary, COLUMNS)
-            self.note(BENCH, before | result)
+            self.note(BENCH, result)
         return result
 
     def train(self, name: str, before: Result, until: float) -> Result:
