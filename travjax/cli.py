@@ -26,8 +26,10 @@ COMMANDS = (terrain, label, map, plan, dataset, weights, train, evaluate, export
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 2 for bad input, 1 where `plan` finds no path or a
-    robot's model fails the check of `physics`."""
+    """Runs one command.
+
+    Returns the exit code: 2 for bad input, 1 where `plan` finds no path or `physics` finds the robot's model wrong.
+    """
 
     def work() -> int | None:
         arguments = _parser().parse_args(argv)

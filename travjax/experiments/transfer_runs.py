@@ -199,7 +199,7 @@ def _name(arm: str) -> str:
 
 
 def _held_out(dataset: Dataset, config: TransferConfig) -> dict[str, Samples]:
-    """Returns samples of the test maps of each site, by its name beside "training" and "validation"."""
+    """Returns samples of the test maps of each site; the trainer has others called training and validation."""
     test = dataset.maps_of("test")
     require(len(test) > 0, "held-out windows", 0, "at least one: a test site or a test strip")
     sites = list(dict.fromkeys(dataset.group[test].tolist()))

@@ -21,7 +21,6 @@ Features = Mapping[str, Float[np.ndarray, "k f"]]
 ORIGIN = "origin"
 """Name in the file of what its features were computed from."""
 
-
 OF = "of "
 """What the names of samples begin with in the file, so that none is the origin's."""
 
